@@ -73,7 +73,7 @@ def check(post: Posterior, draws: Draws, rng: np.random.Generator) -> Predictive
     variance += (priors.SCATTER_MEDIAN[d.channel] * d.unit) ** 2
     z = (d.mean - predicted) / np.sqrt(variance)
     new = rng.normal(size=z.shape)
-    p_values, excess, repeats, warnings = {}, {}, {}, []
+    p_values, excess, repeats, warnings = {}, {}, {}, list[str]()
     for c, name in enumerate(CHANNELS):
         mine = (d.channel == c) & ~d.slope
         if not mine.any():

@@ -46,7 +46,7 @@ from hmmseg.io.task import GROUND
 from hmmseg.io.trial import position_pairs
 from hmmseg.levels import CERTAIN, MOVED
 from hmmseg.robust import robust_sd
-from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
+from hmmseg.segmentation.align import AlignedTrials
 
 WRONG = 0.01  # prior: share of recordings in which one such scale is misstated
 # learned: above the sds of 45 healthy hands by consistency.py of commit f82105c, whose slopes were 3e-4: of
@@ -137,15 +137,12 @@ def _sideways(rig: Rig, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
     pressed = []
     for a, _, weight in _carries(weighed, "force", "fx1", "fx2"):
         free = free_forces(a.signals, a) if a.weights.free.any() else np.zeros(4)
-        left, right = (
-            weight @ np.nan_to_num(a.signals.fx1) - free[0],
-            free[2] - weight @ np.nan_to_num(a.signals.fx2),
-        )
-        if left > 0 and right > 0:
-            pressed.append((left, right))
+        left, right = (weight @ np.nan_to_num(fx) for fx in (a.signals.fx1, -a.signals.fx2))
+        if left > free[0] and right > -free[2]:
+            pressed.append((left - free[0], right + free[2]))
     if pressed:
         left, right = np.median(pressed, axis=0)
-        ratios = np.log([a / b for a, b in pressed])
+        ratios = np.log(np.divide(*np.transpose(pressed)))
         text = (
             f"fx1 and -fx2 press what is carried with {left:.3g} and {right:.3g} N, which should be alike: "
             "one of the fingers is read on another scale"
@@ -213,6 +210,8 @@ def _rigid(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[
     if not found or aligned.late:
         return
     slopes, variances = np.moveaxis(np.array(found), 1, 0)
+    admitted = [*rig.systematic.joint_offset, *rig.systematic.link_length] if rig.jointed else [0.0]
+    made = float(np.linalg.norm(admitted))  # sd of the slope that the rig's own [systematic] makes
     for k, axis in enumerate(("horizontally", "vertically")):
         steep = float(np.median(slopes[:, k]))
         spread = float(np.median(np.abs(slopes[:, k] - steep))) * 1.4826
@@ -222,16 +221,7 @@ def _rigid(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[
             f"block {axis}, which no block does: joint angles, links or bases are farther off than "
             "[systematic] in rig.toml admits"
         )
-        yield Tie("rigidity", steep, error, ("width", "height"), text, _made(rig))
-
-
-def _made(rig: Rig) -> float:
-    """Sd of the slope of a width over the hand's place that the rig's own [systematic] makes."""
-    if not rig.jointed:
-        return 0.0
-    return float(
-        np.hypot(np.linalg.norm(rig.systematic.joint_offset), np.linalg.norm(rig.systematic.link_length))
-    )
+        yield Tie("rigidity", steep, error, ("width", "height"), text, made)
 
 
 def _moving(aligned: AlignedTrials) -> Iterator[Tie]:
@@ -249,14 +239,7 @@ def _moving(aligned: AlignedTrials) -> Iterator[Tie]:
         "the two scales is wrong"
     )
     error = float(robust_sd(logs - np.median(logs)) / np.sqrt(known.size))
-    yield Tie("motion", float(np.median(logs)), error,
-              ("width", "height"), text)  # fmt: skip
-
-
-def _spans(one: TrialAlignment, aligned: AlignedTrials) -> list[tuple[float, float]]:
-    """Start and end [s] of every subtask of a trial."""
-    edges = [float(one.signals.t[0]), *(b.quantile(0.5) for b in one.boundaries), float(one.signals.t[-1])]
-    return list(pairwise(np.maximum.accumulate(edges)))
+    yield Tie("motion", float(np.median(logs)), error, ("width", "height"), text)
 
 
 def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iterator[Grip]:
@@ -275,8 +258,9 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
     """No fingertip is where a block stands: by how far one is in the median trial."""
     task, every = aligned.task, []
     for a, one in zip(weighed, aligned.trials, strict=True):
-        s, deepest, spans = a.signals, 0.0, _spans(one, aligned)
-        support = dict(task.initial)
+        s, deepest, support = a.signals, 0.0, dict(task.initial)
+        edges = [one.signals.t[0], *(b.quantile(0.5) for b in one.boundaries), one.signals.t[-1]]
+        spans = list(pairwise(np.maximum.accumulate(edges)))
         grips = list(_grips(a, aligned, one.present))
         for grip in grips:
             start, end = spans[grip.subtask]
@@ -319,15 +303,12 @@ def _levels(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Des
             beneath = stack(support, grip.object)
             if all(name in heights for name in beneath):
                 bottom = sum(heights[name] for name in beneath)
-                above = grip.y - bottom - heights.get(grip.object, np.inf)
-                below = bottom - grip.y
-                off.setdefault((grip.move, grip.key), []).append(
-                    max(above, 0.0) if above > below else min(-below, 0.0)
-                )
+                above, below = grip.y - bottom - heights.get(grip.object, np.inf), bottom - grip.y
+                far = max(above, 0.0) if above > below else min(-below, 0.0)
+                off.setdefault((grip.move, grip.key), []).append(far)
     if off:
-        move, far = max(
-            ((m, float(np.median(v))) for (m, _), v in off.items()), key=lambda each: abs(each[1])
-        )
+        usual = [(m, float(np.median(v))) for (m, _), v in off.items()]
+        move, far = max(usual, key=lambda each: abs(each[1]))
         where = "above its top" if far > 0 else "beneath its bottom"
         text = (
             f"{aligned.task.performed[move].object} is held {1e3 * abs(far):.2g} mm {where}: the fingers' "
@@ -343,11 +324,8 @@ def _heights(design: Design) -> dict[str, float]:
     if not rows.any() or not mine:
         return {}
     found = np.linalg.lstsq(design.coefficients[rows][:, mine], design.mean[rows], rcond=None)[0]
-    return {
-        design.unknowns[i].name[0]: float(v)
-        for i, v in zip(mine, found, strict=True)
-        if design.unknowns[i].single
-    }
+    unknowns = [design.unknowns[i] for i in mine]
+    return {u.name[0]: float(v) for u, v in zip(unknowns, found, strict=True) if u.single}
 
 
 MISREAD = 0.5  # prior: share of forces among what is to blame where pads and forces contradict each other
@@ -372,10 +350,8 @@ class ForceScale:
     def corrected(self, chain: np.ndarray, weights: list[int], rng: np.random.Generator) -> np.ndarray:
         """Draws (walkers, steps, Q), those of `weights` [N] with g drawn from its posterior."""
         out, size = chain.copy(), chain.shape[:2]
-        log_g = np.where(
-            rng.uniform(size=size) < self.probability, rng.choice(GRID, size, p=self.density), 0.0
-        )
-        out[..., weights] *= np.exp(-log_g)[..., None]
+        misread = rng.uniform(size=size) < self.probability
+        out[..., weights] *= np.exp(-misread * rng.choice(GRID, size, p=self.density))[..., None]
         return out
 
     def remark(self) -> str:
@@ -411,9 +387,10 @@ def force_scale(doubt: PadDoubt, weighed: Sequence[WeighedTrial], rig: Rig) -> F
                 out = out - 0.5 * ((seen - true) / error) ** 2 - np.log(error)
         return out
 
+    excess = _noise_excess(weighed, rig)
+
     def noise(of_x: np.ndarray | float, of_y: np.ndarray | float) -> np.ndarray:
         """Log likelihood of the noise of both axes, read `of` (logarithms) times too large."""
-        excess = _noise_excess(weighed, rig)
         if excess is None:
             return np.zeros(GRID.size)
         covariance = np.full((2, 2), NOISE_LOG_SD**2) + AXIS_LOG_SD**2 * np.eye(2)
@@ -427,8 +404,8 @@ def force_scale(doubt: PadDoubt, weighed: Sequence[WeighedTrial], rig: Rig) -> F
     def evidence(log_likelihood: np.ndarray, sd: float) -> float:
         return float(np.logaddexp.reduce(normal_prior(sd) + log_likelihood))
 
-    foam = max(evidence(pads(share, share), PADS_LOG_SD), evidence(pads(share, 0.0), PADS_LOG_SD),
-               evidence(pads(0.0, share), PADS_LOG_SD))  # fmt: skip
+    wrong_pads = (pads(share, share), pads(share, 0.0), pads(0.0, share))
+    foam = max(evidence(each, PADS_LOG_SD) for each in wrong_pads)
     both, vertical = pads(share, share) + noise(GRID, GRID), pads(0.0, share) + noise(0.0, GRID)
     right = float((pads(0.0, 0.0) + noise(0.0, 0.0))[0])
     log_odds = np.array([

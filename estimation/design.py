@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from itertools import product
 from math import gcd, lcm
 from operator import itemgetter
 
@@ -70,14 +71,10 @@ def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str
     rest = [{k: Fraction(v) for k, v in row.items() if k not in known} for row in given]
     left = [_whole(row, order) for row in rest if row] + [r for r in echelon if len(r) > 1]
     chosen = list(single)
-    for row in sorted(left, key=_complexity):
+    for row in sorted(left, key=lambda r: (len(r), min(r.values()) < 0, sum(map(abs, r.values())))):
         if len(_echelon([*chosen, row], order)) > len(chosen):
             chosen.append(row)
     return sorted(single, key=lambda row: order.index(next(iter(row)))) + chosen[len(single) :]
-
-
-def _complexity(row: Terms) -> tuple[int, bool, int]:
-    return len(row), any(v < 0 for v in row.values()), sum(abs(v) for v in row.values())
 
 
 def _echelon(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[dict[str, Fraction]]:
@@ -130,17 +127,12 @@ def determined(
     task: BlockTask, objects: Sequence[str], rises: dict[int, Terms], there: np.ndarray
 ) -> tuple[Unknown, ...]:
     """What the moves recorded in `there` (num_moves, 3) determine, objects in the task's order."""
-    names = list(task.objects)
-    held = {
-        c: {obj for obj, seen in zip(objects, there[:, c], strict=True) if seen} for c in (FORCE, DISTANCE)
-    }
+    weighed, spanned = (set(np.array(objects)[there[:, c]]) for c in (FORCE, DISTANCE))
+    heights = simplest_combinations([rises[m] for m in np.flatnonzero(there[:, RISE])], task.objects)
     out = []
-    recorded = [rises[m] for m, seen in enumerate(there[:, RISE]) if seen]
-    heights = simplest_combinations(recorded, names)
-    for name in names:
-        out += [Unknown("weight", {name: 1})] * (name in held[FORCE])
-        out += [Unknown("width", {name: 1})] * (name in held[DISTANCE])
-        out += [Unknown("height", {name: 1})] * ({name: 1} in heights)
+    for name in task.objects:
+        shown = {"weight": name in weighed, "width": name in spanned, "height": {name: 1} in heights}
+        out += [Unknown(prop, {name: 1}) for prop, seen in shown.items() if seen]
     return (*out, *(Unknown("height", terms) for terms in heights if len(terms) > 1))
 
 
@@ -283,24 +275,20 @@ def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0
     `biased` (4,): extra prior sd of each force bias [N]; `doubt`: of the pads' compliances; `touch_sd`
     [m]: how well the distance is known at which the fingers touch a block.
     """
-    s, out = rig.systematic, []
-    for i, name in enumerate(FORCE_CHANNELS):
-        sd = float(np.hypot(s.force_bias[i], biased[i]))
+    s, out = rig.systematic, list[Nuisance]()
+
+    def admit(name: str, sd: float, step: float, read: Callable[[Trial, Rig, float], Signals]) -> None:
         if sd > 0:
-            out.append(Nuisance(f"force_bias.{name}", sd, 1e-3,
-                                _with_channel(name, lambda f, b: f - b)))  # fmt: skip
-        if s.force_gain[i] > 0:
-            out.append(Nuisance(f"force_gain.{name}", s.force_gain[i], 1e-3,
-                                _with_channel(name, lambda f, g: f / (1 + g))))  # fmt: skip
+            out.append(Nuisance(name, float(sd), step, read))
+
+    for name, bias, more, gain in zip(FORCE_CHANNELS, s.force_bias, biased, s.force_gain, strict=True):
+        admit(f"force_bias.{name}", np.hypot(bias, more), 1e-3, _with_channel(name, lambda f, b: f - b))
+        admit(f"force_gain.{name}", gain, 1e-3, _with_channel(name, lambda f, g: f / (1 + g)))
     if rig.jointed:
-        for i, name in enumerate(JOINTS):
-            if s.joint_offset[i] > 0:
-                out.append(Nuisance(f"joint_offset.{name}", s.joint_offset[i], 1e-5,
-                                    _with_channel(name, lambda q, d: q - d)))  # fmt: skip
-        for i, (finger, link) in enumerate([(1, 0), (1, 1), (2, 0), (2, 1)]):
-            if s.link_length[i] > 0:
-                out.append(Nuisance(f"link_length.{finger}{link + 1}", s.link_length[i], 1e-5,
-                                    _longer_link(finger, link)))  # fmt: skip
+        for name, sd in zip(JOINTS, s.joint_offset, strict=True):
+            admit(f"joint_offset.{name}", sd, 1e-5, _with_channel(name, lambda q, d: q - d))
+        for (finger, link), sd in zip(product((1, 2), (0, 1)), s.link_length, strict=True):
+            admit(f"link_length.{finger}{link + 1}", sd, 1e-5, _longer_link(finger, link))
     # What slopes show is compliance and exponent together, so either may be off by as much as both; the bend
     # is that of what gives.
     stated = min(max(doubt.extra_sd("normal"), *s.pad_stiffness) / np.log(2), MOST_BENT)
@@ -312,18 +300,15 @@ def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0
         admitted = 0.0 if give else common
         both = max(found, UNSTATED if give else 0.0)
         both = float(np.hypot(np.hypot(both, bends[kind]) if both else 0.0, admitted))
-        if both:
-            out.append(Nuisance(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis)))
+        admit(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis))
         for finger in (1, 2):
             own = 0.0 if give else s.pad_stiffness[finger - 1]
-            sd = float(np.sqrt(own**2 - admitted**2 + (UNLIKE * max(found, give)) ** 2))
-            if sd > 0:
-                out.append(Nuisance(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis)))
-        if bends[kind] and any(n.name.startswith(f"pad_{kind}") for n in out):
+            sd = np.sqrt(own**2 - admitted**2 + (UNLIKE * max(found, give)) ** 2)
+            admit(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis))
+        if any(n.name.startswith(f"pad_{kind}") for n in out):
             usual = max(getattr(doubt, f"usual_{kind}"), 1e-3)
-            out.append(Nuisance(f"pad_{kind}_exponent", bends[kind], 1e-3, _bent_pads(axis, usual)))
-    if touch_sd > 0:
-        out.append(Nuisance("touch", touch_sd, 1e-5, _wider))
+            admit(f"pad_{kind}_exponent", bends[kind], 1e-3, _bent_pads(axis, usual))
+    admit("touch", touch_sd, 1e-5, _wider)
     return tuple(out)
 
 
@@ -335,11 +320,11 @@ SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing"
 
 def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
-    values = channel_values(signals, rig)
-    out = []
+    values, out = {k: np.nan_to_num(v) for k, v in channel_values(signals, rig).items()}, []
     for move in moves:
-        weights, counts = weighed.weights.grips[move], weighed.weights.counts[move]
-        means = {k: _mean(w, values[k], counts[k]) for k, w in weights.items()}
+        counts = weighed.weights.counts[move]
+        means = {k: np.where(counts[k] > 0, w @ values[k], np.nan)
+                 for k, w in weighed.weights.grips[move].items()}  # fmt: skip
         out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
     return np.moveaxis(np.array(out), 2, 0)
 
@@ -371,52 +356,39 @@ def pad_doubt(
     that of the surest of them.
     """
     admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
-    found, possible, shared = {}, {DISTANCE: 0.0, RISE: 0.0}, {}
-    surest = {DISTANCE: (0.0, np.inf), RISE: (0.0, np.inf)}
-    for channel, stiffness in (
-        (DISTANCE, rig.fingertip.normal_stiffness), (RISE, rig.fingertip.shear_stiffness),
-    ):  # fmt: skip
+    found, possible, shared = {}, {}, {}
+    surest, tip = {DISTANCE: (0.0, np.inf), RISE: (0.0, np.inf)}, rig.fingertip
+
+    def seen(kinds: Sequence[int]) -> list[np.ndarray]:
+        known = np.isfinite(slopes[..., kinds])
+        return [values[..., kinds][known] for values in (slopes, variance, alike)]
+
+    for channel, stiffness in ((DISTANCE, tip.normal_stiffness), (RISE, tip.shear_stiffness)):
         stated = bool(np.isfinite(stiffness))
         kinds = [k for k, (c, _) in enumerate(SLOPES.values()) if c == channel]
-        seen = np.isfinite(slopes[..., kinds])
-        mine = [values[..., kinds][seen] for values in (slopes, variance, alike)]
-        shared[channel] = shared_error(mine[2], mine[1])
-        found[channel] = (0.0, 0.0)
+        share, spread, together = seen(kinds)
+        shared[channel], found[channel] = shared_error(together, spread), (0.0, 0.0)
+        possible[channel] = 0.0 if stated else possible_share(share, spread)
         for k in kinds:
-            of_kind = np.isfinite(slopes[..., k])
-            one = [values[..., k][of_kind] for values in (slopes, variance, alike)]
-            apart = shared_error(one[2], one[1])
-            if one[0].size:
-                middle, error = middle_share(one[0], one[1], 0.0)
-                surest[channel] = min(
-                    surest[channel], (middle, float(np.hypot(error, apart))), key=itemgetter(1)
-                )
-            said = misstated(one[0], one[1], stated, admitted if stated else 0.0, apart)
+            share, spread, together = seen([k])
+            apart = shared_error(together, spread)
+            if share.size:
+                middle, error = middle_share(share, spread, 0.0)
+                one = middle, float(np.hypot(error, apart))
+                surest[channel] = min(surest[channel], one, key=itemgetter(1))
+            said = misstated(share, spread, stated, admitted if stated else 0.0, apart)
             found[channel] = max(found[channel], said, key=itemgetter(1))
-        if not stated:
-            possible[channel] = possible_share(mine[0], mine[1])
-    normal, shear = (
-        float(np.median(np.concatenate(forces))) for forces in zip(*map(_usual, weighed), strict=True)
-    )
+    usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
+    for s, grip in ((a.signals, grip) for a in weighed for grip in a.weights.grips.values()):
+        along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
+        usual.append((np.mean(grip["distance"] @ along), abs(np.mean(grip["place"] @ up))))
+    normal, shear = np.median(usual, axis=0).tolist()
     # A width reads too small by the share of the give that the rig leaves out, a height too large.
     return PadDoubt(
         -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], normal, shear,
         (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
         seen=((-surest[DISTANCE][0], surest[DISTANCE][1]), surest[RISE]),
     )  # fmt: skip
-
-
-def _usual(weighed: WeighedTrial) -> tuple[np.ndarray, np.ndarray]:
-    """Mean forces of one finger (num_moves,) along the grip, and in shear where the block is put down [N]."""
-    s, grips = weighed.signals, weighed.weights.grips.values()
-    along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
-    return np.array([np.mean(w["distance"] @ along) for w in grips]), np.array(
-        [abs(np.mean(w["place"] @ up)) for w in grips]
-    )
-
-
-def _mean(weights: np.ndarray, values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    return np.where(counts > 0, weights @ np.nan_to_num(values), np.nan)
 
 
 def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
@@ -437,18 +409,15 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     """
     force = np.abs(raw[..., FORCE]).mean(axis=1)
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
-    grip, lever, landed = [], [], []
+    gives = []
     for a in weighed:
         squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
-        grips = a.weights.grips.values()
-        grip.append([np.mean(w["distance"] @ squeeze) for w in grips])
-        place = [np.mean(w["place"] @ shear) for w in grips]
-        lever.append([p - np.mean(w["pickup"] @ shear) for p, w in zip(place, grips, strict=True)])
-        landed.append([abs(p - np.mean(w["force"] @ shear)) for p, w in zip(place, grips, strict=True)])
+        gives.append([(np.mean(w["distance"] @ squeeze), *(np.mean(w[k] @ shear) for k in
+                      ("pickup", "force", "place"))) for w in a.weights.grips.values()])  # fmt: skip
+    grip, picked, carried, placed = np.moveaxis(np.array(gives), -1, 0)
     hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
-    rise = np.array(lever)
-    least = np.maximum(hanging, np.array(landed))
-    rise = np.where(rise < 0, -1.0, 1.0) * np.maximum(np.abs(rise), least)
+    least = np.maximum(hanging, np.abs(placed - carried))
+    rise = np.where(placed < picked, -1.0, 1.0) * np.maximum(np.abs(placed - picked), least)
     return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
 
 
@@ -489,13 +458,8 @@ def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray
 
 def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
     """Mean recorded rise [m] of the moves that should have none, where they were recorded."""
-    out = {}
-    for move, rise in rises.items():
-        recorded = raw[:, :, move, RISE]
-        recorded = recorded[np.isfinite(recorded)]
-        if not rise and recorded.size:
-            out[move] = float(recorded.mean())
-    return out
+    level = {move: raw[:, :, move, RISE] for move, rise in rises.items() if not rise}
+    return {move: float(np.nanmean(r)) for move, r in level.items() if np.isfinite(r).any()}
 
 
 BIASED = 0.0025  # prior: share of forces whose zero the rig has wrong: those of one recording in a hundred
@@ -606,12 +570,11 @@ def build(
     free_shifts = np.zeros((*free_mean.shape, len(deviations)))
     for j, deviation in enumerate(deviations):
         for i, (trial, a) in enumerate(zip(trials, weighed, strict=True)):
-            read, size = thin(deviation.read(trial, rig, deviation.step), _rate(a.signals)), deviation.sd
-            change = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) / deviation.step
-            shifts[i, ..., j] = change * size
-            change = np.nan_to_num(slopes[i] - observe_slopes(read, a, rig, moves)) / deviation.step
-            slope_shifts[i, ..., j] = change * size
-            free_shifts[i, :, j] = (free_mean[i] - free_forces(read, a)) / deviation.step * size
+            rate = 1.001 / float(np.median(np.diff(a.signals.t)))  # so that groups are as in these signals
+            read, per = thin(deviation.read(trial, rig, deviation.step), rate), deviation.sd / deviation.step
+            shifts[i, ..., j] = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) * per
+            slope_shifts[i, ..., j] = np.nan_to_num(slopes[i] - observe_slopes(read, a, rig, moves)) * per
+            free_shifts[i, :, j] = (free_mean[i] - free_forces(read, a)) * per
     where, steep = np.nonzero(there), np.nonzero(np.isfinite(slopes))
     mean, spread, rows = _combined(raw, variance, valid, coefficients, where)
     rows = np.concatenate([rows, np.zeros((steep[0].size, len(unknowns)))])
@@ -655,8 +618,3 @@ def _combined(
     shift = values - predicted - average(values - predicted)[:, None]
     between = average(shift**2) * num / np.maximum(num - 1, 1)
     return mean, within + (1 + 1 / num) * between, row
-
-
-def _rate(signals: Signals) -> float:
-    """A rate at which thinning groups samples as it did for these signals."""
-    return 1.0 / float(np.median(np.diff(signals.t))) * 1.001

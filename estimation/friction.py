@@ -17,7 +17,6 @@ from scipy.special import logsumexp
 from estimation.observations import MIN_FREE, WeighedTrial, gravity_factor
 from estimation.report import summary
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
-from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.levels import CERTAIN, FIRM, SURE
@@ -189,7 +188,7 @@ def slip_evidence(
     moved = []
     for coefficient in np.quantile(bound_draws, (0.1, 0.5, 0.9)):
         own = still.copy()
-        own[:, :count] = _may_slip(batch, still, *_slip_path(every[:count], float(coefficient), batch))
+        own[:, :count] = _may_slip(batch, still, every[:count], float(coefficient))
         moved.append(own)
     joint = log_drift.T + np.sum(moved, axis=2)
     factor = float(logsumexp(joint) - np.log(len(moved)) - logsumexp(log_drift[:, 0] + still.sum(axis=1)))
@@ -218,23 +217,15 @@ def _padded(stretches: list[Stretch]) -> _Batch:
     return out
 
 
-def _slip_path(stretches: list[Stretch], coefficient: float, batch: _Batch) -> tuple[np.ndarray, np.ndarray]:
-    """Time [s] during which each pad may have slipped until each sample, and the same signed by shear.
-
-    Arrays (len(stretches), longest stretch).
-    """
+def _may_slip(batch: _Batch, still: np.ndarray, stretches: list[Stretch], coefficient: float) -> np.ndarray:
+    """Log density (num_drifts, num_stretches) where each pad slips at some speed or is stuck."""
+    # Times [s] during which each pad may have slipped until each sample, and the same signed by shear.
     time, signed = np.zeros((2, len(stretches), batch.t.shape[1]))
     for i, s in enumerate(stretches):
         near = np.sign(s.ratio) * (np.abs(s.ratio) >= coefficient - NEAR * s.ratio_sd)
         sign = np.where(near[1:] != 0, near[1:], near[:-1])
-        steps = np.diff(s.t)
-        time[i, 1 : s.t.size] = np.cumsum(steps * np.abs(sign))
-        signed[i, 1 : s.t.size] = np.cumsum(steps * sign)
-    return time, signed
-
-
-def _may_slip(batch: _Batch, still: np.ndarray, time: np.ndarray, signed: np.ndarray) -> np.ndarray:
-    """Log density (num_drifts, num_stretches) where each pad slips at some speed or is stuck."""
+        time[i, 1 : s.t.size] = np.cumsum(np.diff(s.t) * np.abs(sign))
+        signed[i, 1 : s.t.size] = np.cumsum(np.diff(s.t) * sign)
     out = still[:, : len(time)].copy()
     near = np.flatnonzero(time.any(axis=1))
     if near.size == 0:
@@ -286,7 +277,8 @@ def largest_ratio(
     (num_alignments, num_samples): under which drawn alignment each sample counts. Alignments are
     marginalised in the maximum; G is learned from the samples of all of them.
     """
-    edges = _edges(ratio, sd)
+    end = float(np.max(ratio + REACH * sd))
+    edges = np.linspace(0.0, end, int(np.clip(BINS_PER_SD * end / sd.min(), 20, MAX_BINS)) + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     # A Dirichlet's upper part is independent of how its lower part is split: samples that cannot
     # be the largest enter by their number only.
@@ -297,7 +289,9 @@ def largest_ratio(
     top = centres > cut - REACH * sd[high].max()
     low_count = float((~high).sum()) + CONCENTRATION * float(np.mean(~top))
     prior = np.full(int(top.sum()), CONCENTRATION / centres.size)
-    likelihood = _likelihood(ratio[high], sd[high], centres[top])
+    # Of measured absolute ratios given the true ones (num_samples, num_bins).
+    z = np.stack([sign * ratio[high][:, None] - centres[top] for sign in (1, -1)]) / sd[high][:, None]
+    likelihood = np.exp(-0.5 * z**2).sum(axis=0) / (sd[high][:, None] * np.sqrt(2 * np.pi))
     log_likelihood = np.log(likelihood + 1e-300)
     glitch = GLITCH / (1 - GLITCH) / edges[-1]
     held = held[:, high]
@@ -318,18 +312,6 @@ def largest_ratio(
     upper = edges[np.flatnonzero(top)[0] :]
     quantiles = (rng.permutation(num_draws) + rng.uniform(size=num_draws)) / num_draws
     return np.interp(quantiles * levels[-1], levels, upper)
-
-
-def _edges(ratio: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Bins of G from 0 past the largest ratio."""
-    end = float(np.max(ratio + REACH * sd))
-    return np.linspace(0.0, end, int(np.clip(BINS_PER_SD * end / sd.min(), 20, MAX_BINS)) + 1)
-
-
-def _likelihood(ratio: np.ndarray, sd: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Density (num_samples, num_bins) of measured absolute ratios given the true ones."""
-    z = np.stack([ratio[:, None] - centres, ratio[:, None] + centres]) / sd[:, None]
-    return np.exp(-0.5 * z**2).sum(axis=0) / (sd[:, None] * np.sqrt(2 * np.pi))
 
 
 def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -391,15 +373,6 @@ class _Forces:
     sd_shear: float
 
 
-@dataclass(frozen=True)
-class _Held:
-    """Held samples of one block: ratios, their noise, alignments (num_alignments, num_samples)."""
-
-    ratio: np.ndarray
-    sd: np.ndarray
-    held: np.ndarray
-
-
 def friction_posteriors(
     weighed: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
     rng: np.random.Generator,
@@ -415,15 +388,16 @@ def friction_posteriors(
     out = {}
     for obj in task.objects:
         ground = ground_friction(weighed, task, steps, obj, rig, sd_force, rng, DRAWS)
-        samples = held[obj]
-        if samples.ratio.size == 0:
+        if held[obj][0].size == 0:
             reason = f"the recording never shows {obj} held firmly"
             out[obj] = FrictionPosterior(None, reason=reason, ground=ground)
             continue
-        draws = largest_ratio(samples.ratio, samples.sd, samples.held, rng, DRAWS)
+        draws = largest_ratio(*held[obj], rng, DRAWS)
         others = [s for other in task.objects if other != obj for s in resting[other]]
         slip = slip_evidence(resting[obj], others, draws)
-        draws = draws * _gain_factor(rig, rng)
+        gain = rig.systematic.force_gain  # an uncertain one stretches every ratio
+        worst = max(np.hypot(gain[0], gain[1]), np.hypot(gain[2], gain[3]))
+        draws = draws * np.exp(worst * rng.standard_normal(DRAWS))
         reason = None if slip.seen else f"no finger was seen to slip on {obj}: a bound is all it tells"
         out[obj] = FrictionPosterior(
             float(np.quantile(draws, 0.05)), draws, draws if slip.seen else None, slip, reason, ground
@@ -476,7 +450,8 @@ def _ratio(forces: _Forces, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _held(
     weighed: Sequence[WeighedTrial], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str
-) -> _Held:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Held samples of one block: ratios, their noise, alignments (num_alignments, num_samples)."""
     moves = sorted({s.move for s in steps if s.object == obj and s.move is not None})
     ratios, sds, masks = [np.zeros(0)], [np.zeros(0)], []
     for a, pair in zip(weighed, fingers, strict=True):
@@ -490,7 +465,7 @@ def _held(
                 sds.append(sd)
                 masks.append(holding[:, use])
     held = np.concatenate(masks, axis=1) if masks else np.zeros((1, 0), bool)
-    return _Held(np.concatenate(ratios), np.concatenate(sds), held)
+    return np.concatenate(ratios), np.concatenate(sds), held
 
 
 def _stretches(
@@ -511,24 +486,13 @@ def _stretches(
             for number, forces in enumerate(pair, 1):
                 height = getattr(a.signals, f"y{number}")
                 use = resting.all(axis=0) & _firm(forces, resting) & np.isfinite(height)
-                ratio, ratio_sd = _ratio(forces, use)
-                sd = np.hypot(_height_noise(a.signals, height)[use], forces.sd_shear * compliance)
+                bend = np.diff(height, 2)
+                bend = bend[np.isfinite(bend)]  # shows a height's noise where the rig states none
+                learned = max(robust_sd(bend) / np.sqrt(6.0), 1e-7) if bend.size else 1e-4
+                sd_height = np.where(np.isfinite(a.signals.sd_y), a.signals.sd_y, learned)[use]
+                sd = np.hypot(sd_height, forces.sd_shear * compliance)
                 out.append(Stretch(
                     a.signals.t[use], (height - forces.shear * compliance)[use], sd,
-                    forces.shear[use], ratio, ratio_sd, compliance,
+                    forces.shear[use], *_ratio(forces, use), compliance,
                 ))  # fmt: skip
     return out
-
-
-def _height_noise(signals: Signals, height: np.ndarray) -> np.ndarray:
-    """Noise sd (num_timesteps,) of one finger's height [m]; learned where the rig states none."""
-    bend = np.abs(np.diff(height, 2))
-    learned = robust_sd(bend[np.isfinite(bend)]) / np.sqrt(6.0) if np.isfinite(bend).any() else 1e-4
-    return np.where(np.isfinite(signals.sd_y), signals.sd_y, max(learned, 1e-7))
-
-
-def _gain_factor(rig: Rig, rng: np.random.Generator) -> np.ndarray:
-    """Factors (DRAWS,) by which uncertain force gains stretch every ratio."""
-    gain = np.asarray(rig.systematic.force_gain)
-    worst = max(np.hypot(gain[0], gain[1]), np.hypot(gain[2], gain[3]))
-    return np.exp(worst * rng.standard_normal(DRAWS))

@@ -100,7 +100,7 @@ class Identification(Tabled):
 
     def to_json(self) -> dict:
         """The body of `identify`'s JSON document."""
-        properties: dict[str, dict] = {}
+        properties, found = dict[str, dict](), self.sampled
         for obj in self.task.objects:
             entry: dict = {}
             for prop, unit in UNITS.items():
@@ -114,7 +114,10 @@ class Identification(Tabled):
         return {
             "trials": [s.to_json() for s in self.segmentations],
             "method": "bayes",
-            "sampler": self._sampler(),
+            "sampler": None if found is None else {
+                "walkers": found.chain.shape[0], "steps": found.steps, "ess": found.ess, "rhat": found.rhat,
+                "acceptance": found.acceptance, "converged": found.converged,
+            },
             "properties": properties,
             "combinations": [
                 {"of": {f"{obj}.{u.prop}": c for obj, c in u.terms.items()}} | summary(column, UNITS[u.prop])
@@ -123,15 +126,6 @@ class Identification(Tabled):
             "reasons": self.reasons,
             "predictive": None if self.predictive is None else self.predictive.to_json(),
             "notes": list(self.notes),
-        }
-
-    def _sampler(self) -> dict | None:
-        if self.sampled is None:
-            return None
-        found = self.sampled
-        return {
-            "walkers": found.chain.shape[0], "steps": found.steps, "ess": found.ess, "rhat": found.rhat,
-            "acceptance": found.acceptance, "converged": found.converged,
         }  # fmt: skip
 
     def tables(self):

@@ -26,7 +26,7 @@ from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.levels import TAIL
-from hmmseg.robust import robust_sd
+from hmmseg.robust import median_of_known, robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.emissions import acceleration, thin
@@ -59,18 +59,12 @@ def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str,
     pads, out = pads_of(aligned.rig), dict[str, float]()
     if any(one.trial.inertia is not None for one in aligned.trials):
         return out
-    root2 = np.sqrt(2.0)
     for s in signals:
-        rise = np.hypot(s.sd_y, s.sd_force * pads.shear1) / root2
-        sds = {
-            "force": np.full(1, root2 * s.sd_force),
-            "distance": root2 * np.hypot(s.sd_x, s.sd_force * pads.normal1),
-            "pickup": rise,
-            "place": rise,
-        }
+        width = median_of_known(np.hypot(s.sd_x, s.sd_force * pads.normal1))
+        height = median_of_known(np.hypot(s.sd_y, s.sd_force * pads.shear1)) / 2
+        sds = {"force": s.sd_force, "distance": width, "pickup": height, "place": height}
         for key, sd in sds.items():
-            known = sd[np.isfinite(sd)]
-            out[key] = max(out.get(key, 0.0), float(np.median(known)) if known.size else np.nan)
+            out[key] = max(out.get(key, 0.0), float(np.sqrt(2.0) * sd))
     return out
 
 
@@ -111,9 +105,8 @@ def autocorrelation_time(series: list[np.ndarray]) -> float:
     residuals cancel, as differentiated noise does. Series about their own mean are biased by
     -1 / length, which is put back.
     """
-    bias = len(series) / max(sum(r.size for r in series), 1)
-    power = sum(float(r @ r) for r in series)
-    size = sum(r.size for r in series)
+    power, size = sum(float(r @ r) for r in series), sum(r.size for r in series)
+    bias = len(series) / max(size, 1)
 
     def rho(lag: int) -> float:
         if lag == 0:
@@ -196,14 +189,10 @@ def subtask_masks(times: np.ndarray, boundaries: np.ndarray, num_subtasks: int) 
 
 def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
     """Subtask indices that each mean of a grip is taken over."""
-    of_move = [s for s in steps if s.move == move]
-    ground = [s.index for s in of_move if s.state == ON_GROUND]
-    return {
-        "force": [s.index for s in of_move if s.state == ABOVE_GROUND],
-        "distance": [s.index for s in of_move if s.state != FREE],
-        "pickup": ground[:1],
-        "place": ground[1:],
-    }
+    held = [s for s in steps if s.move == move and s.state != FREE]
+    ground, above = ([s.index for s in held if s.state == state] for state in (ON_GROUND, ABOVE_GROUND))
+    every = [s.index for s in held]
+    return {"force": above, "distance": every, "pickup": ground[:1], "place": ground[1:]}
 
 
 def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
@@ -277,7 +266,7 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
                 every = masks[:, members].any(axis=1) * weight
                 total = every.sum(axis=1, keepdims=True)
                 grips[move][key] = every / np.where(total > 0, total, 1.0)
-                counts[move][key] = (masks[:, members].any(axis=1) & (weight > 0)).sum(axis=1)
+                counts[move][key] = (every > 0).sum(axis=1)
         free = best[[s.index for s in steps if s.state == FREE]].any(axis=0)
         free &= np.isfinite(thinned.fx1 + thinned.fy1 + thinned.fx2 + thinned.fy2)
         # Next to a contact change one finger alone may touch, and a sample be contact already.
@@ -285,8 +274,12 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
         free &= np.convolve(~free, np.ones(2 * margin + 1), "same") == 0
         robust = np.zeros((len(FORCE_CHANNELS), free.size))
         for row, name in zip(robust, FORCE_CHANNELS, strict=True):
-            scale = _free_scale(thinned, name, free)
-            weight, residual, _ = robust_weights(getattr(thinned, name), free, scale)
+            force = getattr(thinned, name)
+            if free.sum() < MIN_FREE:  # where there is next to no free motion, what the rig states
+                scale = thinned.sd_force if np.isfinite(thinned.sd_force) else 1.0
+            else:
+                scale = max(robust_sd(force[free] - np.median(force[free])), 1e-9)
+            weight, residual, _ = robust_weights(force, free, scale)
             row[:] = np.where(free, weight, 0.0) / max(weight[free].sum(), 1e-9)
             scales[name] = max(scales.get(name, 0.0), scale)
             pooled.setdefault(name, []).append((residual[free], weight[free]))
@@ -310,14 +303,6 @@ def free_forces(signals: Signals, aligned: WeighedTrial) -> np.ndarray:
     """Mean forces (4,) in free motion [N], where they ought to vanish."""
     force = np.stack([getattr(signals, name) for name in FORCE_CHANNELS])
     return (aligned.weights.free_robust * np.nan_to_num(force)).sum(axis=1)
-
-
-def _free_scale(signals: Signals, name: str, free: np.ndarray) -> float:
-    """Robust scale of a force in free motion [N]; where there is next to none, what the rig states."""
-    values = getattr(signals, name)[free]
-    if values.size < MIN_FREE:
-        return signals.sd_force if np.isfinite(signals.sd_force) else 1.0
-    return max(robust_sd(values - np.median(values)), 1e-9)
 
 
 def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: str, rig: Rig) -> float:

@@ -20,7 +20,7 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import TAIL
-from hmmseg.robust import robust_sd, white_sd
+from hmmseg.robust import robust_sd, weighted_median, white_sd
 from hmmseg.tables import Brief
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
@@ -89,11 +89,12 @@ def slope(
     every = np.logical_or.reduce(groups)
     levels = np.stack([np.where(g, 1.0, 0.0) for g in groups])
     others = np.concatenate([levels, np.where(every, np.nan_to_num(rate), 0.0)[None]])
+    values = np.nan_to_num(np.stack([give, reading, place], axis=1)) * every[:, None]
     trust, found, doubt = every.astype(float), None, None
     for _ in range(10):
-        x, y, p = (
-            _less(np.where(every, np.nan_to_num(v), 0.0), others, trust) for v in (give, reading, place)
-        )
+        root = np.sqrt(trust)
+        fitted, *_ = np.linalg.lstsq((others * root).T, values * root[:, None], rcond=None)
+        x, y, p = (values - others.T @ fitted).T
         power = float((trust * x**2).sum())
         if power <= 1e-12 * float((np.nan_to_num(give)[every] ** 2).sum()):
             return None
@@ -134,20 +135,11 @@ def _between(
     return give + k * place, apart
 
 
-def _less(values: np.ndarray, others: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """Values (num_timesteps,) less their weighted least-squares fit by others (num_others, num_timesteps)."""
-    root = np.sqrt(trust)
-    fitted, *_ = np.linalg.lstsq((others * root).T, values * root, rcond=None)
-    return values - fitted @ others
-
-
 def middle_share(shares: np.ndarray, variances: np.ndarray, error: np.ndarray | float) -> tuple[float, float]:
     """Weighted median of slopes (K,) and its standard error, each off by `error` besides its variance."""
-    order = np.argsort(shares)
-    cumulative = np.cumsum((1 / (variances + error**2))[order])
-    middle = float(shares[order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+    weights = 1 / (variances + error**2)
     # A median of normal draws has pi / 2 times the variance of their mean.
-    return middle, float(np.sqrt(np.pi / 2 / cumulative[-1]))
+    return weighted_median(shares, weights), float(np.sqrt(np.pi / 2 / weights.sum()))
 
 
 def shared_error(alike: np.ndarray, variances: np.ndarray) -> float:
@@ -208,7 +200,8 @@ def landing(
     before = np.flatnonzero(carry & usable & (t <= moment))[-BEFORE:]
     if before.size < BEFORE or not np.any(place[usable] > 0):
         return None
-    parabola, line = (_extrapolation(t[before] - moment, degree) for degree in (2, 1))
+    # Weights that make of readings a least-squares polynomial's value at the touch.
+    parabola, line = (np.linalg.pinv(np.vander(t[before] - moment, n))[-1] for n in (3, 2))
     weights = np.where(usable, place, 0.0)
     weights = weights / weights.sum()
     count = 1 / float((weights**2).sum())
@@ -221,11 +214,6 @@ def landing(
     speed = float(np.polyfit(t[before] - moment, y, 1)[0])
     variance = (speed * moment_sd) ** 2 + bend**2 + noise**2 * (float((parabola**2).sum()) + 1 / count)
     return Slope(weights / change, variance / change**2)
-
-
-def _extrapolation(t: np.ndarray, degree: int) -> np.ndarray:
-    """Weights (n,) that make of readings at times t the least-squares polynomial's value at 0."""
-    return np.linalg.pinv(np.vander(t, degree + 1))[-1]
 
 
 def slopes_within(
@@ -250,16 +238,11 @@ def slopes_within(
         known = sd[np.isfinite(sd)]
         noise = float(np.median(known)) if known.size else 0.0
         # What readings are rougher than places is noise of the forces: they ring, what they move does not.
-        rough = [_rough(values[key][group]) for group in together]
+        seen = [values[key][group & np.isfinite(values[key])] for group in together]
+        rough = [white_sd(one) for one in seen if one.size >= MIN_SAMPLES]
         ringing = np.sqrt(max(max(rough, default=0.0) ** 2 - noise**2, 0.0))
         sds = (max(sd_force * compliance, ringing), noise)
         found = slope(signals.t, values[key], place, give, together, scales[key], sds)
         if found is not None:
             out[name] = found
     return out
-
-
-def _rough(readings: np.ndarray) -> float:
-    """White noise (sd) of readings (num_samples,), 0 of too few [m]."""
-    there = readings[np.isfinite(readings)]
-    return white_sd(there) if there.size >= MIN_SAMPLES else 0.0

@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -78,15 +77,8 @@ class PluginEstimates:
         return {"properties": shown, "reasons": dict(self.reasons)}
 
 
-class _Mean(NamedTuple):
-    """A mean over samples, their standard deviation and the mean's standard error."""
-
-    mean: float
-    sd: float
-    error: float
-
-
-Found = tuple[_Mean, list[str]]  # with the labels of the subtasks that it is of
+# A mean over samples, their standard deviation and the mean's standard error (3,), and of which subtasks.
+Found = tuple[np.ndarray, list[str]]
 
 
 @dataclass(frozen=True)
@@ -105,14 +97,14 @@ class _Trial:
         cut = trim * (end - start)
         return self.held & (t >= start + cut) & (t < end - cut)
 
-    def mean(self, name: str, step: Subtask, trim: float = 0.0) -> _Mean | None:
-        """Mean of a signal over these; None of fewer than two that are there, whose scatter is unknown."""
+    def mean(self, name: str, step: Subtask, trim: float = 0.0) -> np.ndarray | None:
+        """Mean of a signal over these, sd and error; None of fewer than two, whose scatter is unknown."""
         values = getattr(self.signals, name)[self.samples(step, trim)]
         values = values[np.isfinite(values)]
         if values.size < 2:
             return None
-        sd = float(np.std(values, ddof=1))
-        return _Mean(float(np.mean(values)), sd, sd / math.sqrt(values.size))
+        sd = np.std(values, ddof=1)
+        return np.array([np.mean(values), sd, sd / math.sqrt(values.size)])
 
 
 def estimate_plugin(
@@ -210,27 +202,19 @@ def _heights(trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ..
         for move, rise in height_equations(task):
             ends = [s for s in steps if s.move == move and s.name in ("pickup", "place")]
             first, last = (trial.mean("y2", s) for s in ends)
-            if rise and first and last:
-                (low, sd, error), (high, high_sd, high_error) = first, last
+            if rise and first is not None and last is not None:
                 rows.append([float(rise.get(name, 0)) for name in task.objects])
-                rises.append((high - low, math.hypot(sd, high_sd), math.hypot(error, high_error)))
+                rises.append([last[0] - first[0], *np.hypot(first[1:], last[1:])])
                 labels.append([s.label for s in ends])
         if not rows:
             continue
         inverse = np.linalg.pinv(rows)
         determined = np.isclose(inverse @ rows, np.eye(len(task.objects)), atol=1e-9).all(axis=1)
-        mean, sd, error = np.array(rises).T
+        mean, *errors = np.array(rises).T
         for name, weights in zip(np.array(task.objects)[determined], inverse[determined], strict=True):
-            combined = _Mean(
-                abs(float(weights @ mean)), *(float(np.hypot.reduce(weights * v)) for v in (sd, error))
-            )
-            used = [
-                label
-                for own, weight in zip(labels, weights, strict=True)
-                if abs(weight) > 1e-9
-                for label in own
-            ]
-            found[name].append((combined, used))
+            combined = np.array([abs(weights @ mean), *(np.hypot.reduce(weights * v) for v in errors)])
+            used = [own for own, weight in zip(labels, weights, strict=True) if abs(weight) > 1e-9]
+            found[name].append((combined, [label for own in used for label in own]))
     return found
 
 

@@ -90,7 +90,8 @@ def draw_corner(
     factors = np.array([SHOWN[prop][0] for _, prop in names])
     shown = draws * factors
     labels = [f"{obj}\n{prop} [{SHOWN[prop][1]}]" for obj, prop in names]
-    truths = [_measured(actual, obj, prop) for obj, prop in names]
+    known = [(actual or {}).get(obj, {}).get(prop) for obj, prop in names]
+    truths = [None if m is None else m[0] * factor for m, factor in zip(known, factors, strict=True)]
     low, high = np.percentile(shown, 0.05, axis=0), np.percentile(shown, 99.95, axis=0)
     ranges, lines = [], []
     for i, truth in enumerate(truths):
@@ -118,11 +119,6 @@ def draw_corner(
         if any(line is not None for line in lines):
             figure.text(1 - RIGHT / size, 0.99, "lines: measured", color=RED, ha="right", va="top")
         return axes
-
-
-def _measured(actual: Actual | None, obj: str, prop: str) -> float | None:
-    found = None if actual is None else actual.get(obj, {}).get(prop)
-    return None if found is None else found[0] * SHOWN[prop][0]
 
 
 ORDER = ("weight", "width", "height", "friction")

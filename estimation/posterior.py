@@ -75,7 +75,9 @@ def log_density(theta: Any, tables: Tables, xp: ModuleType = np) -> Any:
     common = tables.least[None] + xp.concatenate([own, own], axis=1)
     place = xp.clip((2 * (log_k - log_s) - REACH[0]) / STEP, 1.0, tables.log_det.shape[1] - 3.001)
     index = xp.floor(place)
-    weights = _cubic(place - index)
+    t = place - index  # Catmull and Rom's weights of the four neighbours
+    weights = (0.5 * t * (t * (2 - t) - 1), 0.5 * (t**2 * (3 * t - 5) + 2), 0.5 * t * (t * (4 - 3 * t) + 1),
+               0.5 * t**2 * (t - 1))  # fmt: skip
     rows = [(np.arange(NUM_CHANNELS)[None], index.astype(int) + k) for k in (-1, 0, 1, 2)]
     log_det = sum(w * tables.log_det[at] for w, at in zip(weights, rows, strict=True))
     precision = xp.exp(-2 * log_s)
@@ -88,8 +90,9 @@ def log_density(theta: Any, tables: Tables, xp: ModuleType = np) -> Any:
     prior = xp.concatenate([1 / common, xp.zeros((len(theta), size - NUM_SHARES))], axis=1)
     chol = xp.linalg.cholesky(form[:, 1:, 1:] + prior[:, :, None] * np.eye(size)[None])
     white = _solve(chol, form[:, 1:, :1], xp)[..., 0]
-    of_channels = 2 * tables.count[None] * log_s + log_det
-    out = log_prior(theta, tables.scale_sd, xp) - 0.5 * xp.sum(of_channels + _paired(xp.log(common)), axis=1)
+    of_shares = xp.log(common[:, :NUM_CHANNELS]) + xp.log(common[:, NUM_CHANNELS:])
+    of_channels = 2 * tables.count[None] * log_s + log_det + of_shares
+    out = log_prior(theta, tables.scale_sd, xp) - 0.5 * xp.sum(of_channels, axis=1)
     out = out - 0.5 * (form[:, 0, 0] - xp.sum(white**2, axis=1))
     out = out - xp.sum(xp.log(xp.diagonal(chol, axis1=1, axis2=2)), axis=1)
     return xp.where(near, out, -np.inf)
@@ -107,19 +110,6 @@ def padded(tables: Tables, multiple: int) -> Tables:
     hand, added = np.pad(tables.hand, (0, more)), np.arange(more) + len(tables.hand)
     hand[added, added] = 1.0
     return tables._replace(hand=hand, forms=np.pad(tables.forms, ((0, 0), (0, 0), (0, more), (0, more))))
-
-
-def _paired(of_shares: Any) -> Any:
-    """Sums (W, 3) of what is said of e and of f (W, 6), by channel."""
-    return of_shares[:, :NUM_CHANNELS] + of_shares[:, NUM_CHANNELS:]
-
-
-def _cubic(t: Any) -> tuple[Any, Any, Any, Any]:
-    """Weights of the four neighbours at a share t of the way between the middle two (Catmull and Rom)."""
-    return (
-        0.5 * t * (t * (2 - t) - 1), 0.5 * (t**2 * (3 * t - 5) + 2),
-        0.5 * t * (t * (4 - 3 * t) + 1), 0.5 * t**2 * (t - 1),
-    )  # fmt: skip
 
 
 def _solve(chol: Any, right: Any, xp: ModuleType) -> Any:

@@ -15,6 +15,7 @@ from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
 from hmmseg.levels import SURE
 from hmmseg.numbers import SHOWN, estimate, interval, plain
+from hmmseg.tables import listed
 
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
 
@@ -145,9 +146,7 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
 
 def properties_table(body: dict[str, Any], measured=None) -> Table:
     """The properties for people to read, lengths in cm as the paper has them."""
-    table = Table(title=f"properties ({body['method']})", title_justify="left")
-    for head in ("block", "property", "estimate", "95 % interval", *(("measured",) if measured else ())):
-        table.add_column(head, no_wrap=head != "estimate")
+    rows = []
     for obj, entries in body["properties"].items():
         for prop, entry in entries.items():
             shown = SHOWN[prop]
@@ -164,8 +163,9 @@ def properties_table(body: dict[str, Any], measured=None) -> Table:
                 against = body.get("actual", {}).get(obj, {}).get(prop, {})
                 mark = "  disagrees" if against.get("disagrees") else ""
                 cells.append("" if value is None else f"{estimate(value[0], value[1], shown)}{mark}")
-            table.add_row(*cells)
-    return table
+            rows.append(cells)
+    heads = ["block", "property", "estimate", "95 % interval", *(("measured",) if measured else ())]
+    return listed(f"properties ({body['method']})", heads, rows)
 
 
 def inference_data(posterior: dict[str, np.ndarray]) -> Any:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import gammaln
@@ -28,10 +27,6 @@ from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode, poste
 from hmmseg.levels import CERTAIN
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Brief
-
-if TYPE_CHECKING:
-    import emcee
-
 
 TAIL = 5.0  # numerics: degrees of freedom for the noise: proposals need heavier tails than the posterior
 WIDEN = 1.1  # numerics: of the Laplace covariance, likewise
@@ -152,17 +147,6 @@ class Draws(Brief):
         return not self.shortfall
 
 
-def independence_move(independent: Proposal) -> emcee.moves.MHMove:
-    """Move of every walker to an independent draw of the proposal."""
-    import emcee  # slow to import: it loads scipy.stats
-
-    def propose(x: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-        new = independent.draw(len(x), random)
-        return new, independent.log_density(x) - independent.log_density(new)
-
-    return emcee.moves.MHMove(propose)
-
-
 def sample(
     post: Posterior, seed: int, progress: Callable[[int, int], None] | None = None, mode: Mode | None = None
 ) -> Draws:
@@ -173,7 +157,12 @@ def sample(
     random = np.random.RandomState(seed)
     independent = proposal(post, mode)
     start = independent.draw(WALKERS, random)
-    moves = [(independence_move(independent), INDEPENDENT), (emcee.moves.DEMove(), 1 - INDEPENDENT)]
+
+    def anew(x: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+        new = independent.draw(len(x), random)
+        return new, independent.log_density(x) - independent.log_density(new)
+
+    moves = [(emcee.moves.MHMove(anew), INDEPENDENT), (emcee.moves.DEMove(), 1 - INDEPENDENT)]
     sampler = emcee.EnsembleSampler(WALKERS, start.shape[1], post.log_prob, moves=moves, vectorize=True)
     state = sampler.run_mcmc(emcee.State(start, random_state=random.get_state()), BURN_IN)
     sampler.reset()

@@ -25,7 +25,6 @@ from hmmseg.sequence.courses import (
     probabilities,
 )
 from hmmseg.sequence.features import feature_map, features
-from hmmseg.sequence.fit import shares
 
 START = (4.0, -3.0, 0.1, -5.0, -3.0, -2.0)  # numerics: where the search begins, as `weighing_of` takes it
 
@@ -39,7 +38,7 @@ def known(world: World, labelled: int) -> Known:
     mapping = feature_map(world.trials, world.task.channels or tuple(world.trials[0].channels))
     data = [features(trial, mapping) for trial in world.trials]
     factor = max(1, round(float(np.median([len(each.values) for each in data])) / COARSE_CELLS))
-    truth = np.array([shares(each, b) for each, b in zip(data, world.boundaries, strict=True)])
+    truth = np.array([each.shares(b) for each, b in zip(data, world.boundaries, strict=True)])
     labels = np.where(np.arange(len(truth))[:, None] < labelled, truth, np.nan)
     found = find_courses(
         [coarse(each.values, factor) for each in data], len(world.task.sequence), list(labels)

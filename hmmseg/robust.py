@@ -23,6 +23,12 @@ def white_sd(values: np.ndarray, order: int = 2) -> float:
     return robust_sd(np.diff(values, order, axis=0)) / np.sqrt(comb(2 * order, order))
 
 
+def runs(found: np.ndarray) -> list[tuple[int, int]]:
+    """Where each stretch of true samples starts and stops."""
+    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(int)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     """The value, of those that are there, at which half of the weight is reached."""
     keep = np.isfinite(values) & (weights > 0)

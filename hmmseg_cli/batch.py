@@ -6,6 +6,7 @@ processes there are nor on who is done first.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import multiprocessing
@@ -15,22 +16,14 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future,
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import Any
 
 from hmmseg.errors import InputError
+from hmmseg.io.formats import KINDS, kind_of
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import read_task
+from hmmseg.segmentation.spans import Segmentation
 
-if TYPE_CHECKING:
-    from hmmseg.io.rig import Rig
-    from hmmseg.io.task import BlockTask
-    from hmmseg.segmentation.spans import Segmentation
-
-WorkersOption = Annotated[int | None, typer.Option(
-    "--workers", metavar="N", min=1, help="Fit each recording by itself, in N processes.")]  # fmt: skip
-SchedulerOption = Annotated[str | None, typer.Option(
-    "--scheduler", metavar="ADDRESS",
-    help="The same on a Dask cluster, as tcp://host:8786; local: one of this machine.")]  # fmt: skip
 LOCAL = "local"
 PATIENCE = 10.0  # limit: s; how long a cluster is waited for
 
@@ -49,33 +42,22 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
 
     A recording in a .txt file has to be named: in a folder it might be notes.
     """
-    from hmmseg.io.formats import KINDS, kind_of
-
-    out: list[Path] = []
+    out, kinds = list[Path](), [kind for kind in KINDS if kind != ".txt"]
     for path in paths:
-        try:
-            data_set = not path.is_dir() or bool(kind_of(path))
-        except InputError:
-            data_set = False
-        if data_set:
-            out.append(path)
-            continue
-        kinds = [kind for kind in KINDS if kind != ".txt"]
-        inside = sorted(p for p in path.iterdir() if p.suffix.lower() in kinds and p.is_file())
+        inside = [path]
+        if path.is_dir():
+            with contextlib.suppress(InputError):  # a data set
+                kind_of(path)
+                out.append(path)
+                continue
+            inside = sorted(p for p in path.iterdir() if p.suffix.lower() in kinds and p.is_file())
         if not inside:
             raise InputError(str(path), "no recordings in this folder", ", ".join(kinds))
         out += inside
     return out
 
 
-@functools.cache
-def _lab(task: Path, rig: Path) -> tuple[BlockTask, Rig]:
-    from hmmseg.io.rig import read_rig
-    from hmmseg.io.task import BlockTask, read_task
-
-    description = read_task(task)
-    assert isinstance(description, BlockTask)
-    return description, read_rig(rig)
+_LAB = functools.cache(lambda task, rig: (read_task(task), read_rig(rig)))
 
 
 def segment_one(path: Path, task: Path, rig: Path) -> Segmented:
@@ -83,7 +65,7 @@ def segment_one(path: Path, task: Path, rig: Path) -> Segmented:
     from hmmseg.hand.read import read_trial
     from hmmseg.segmentation.align import segment
 
-    description, hand = _lab(task, rig)
+    description, hand = _LAB(task, rig)
     trial = read_trial(path, hand)
     segmentation = replace(segment([trial], description, hand)[0], recorded=None)
     return Segmented(segmentation, tuple(trial.warnings), tuple(trial.notes))

@@ -2,63 +2,41 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
-
-import typer
-from rich.table import Table
+from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
-from hmmseg_cli.console import JsonOption, Output, QuietOption, TrialsArgument, UnusedSeed, distinct_trials
-from hmmseg_cli.diagnose_robot import (
-    MapOption,
-    OwnSimulator,
-    PatchOption,
-    SimulatorOption,
-    read_logs,
-    show_stages,
-    warn_of_engine,
-)
+from hmmseg.numbers import estimate, interval, shown_as
+from hmmseg.tables import listed
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output, distinct_trials
+from hmmseg_cli.diagnose_robot import OwnSimulator, fitted_effects, read_logs, show_stages, warn_of_engine
 
-ModelOption = Annotated[
-    Path | None,
-    typer.Option("--model", "--mjcf", metavar="XML", help="The robot's model, as MuJoCo reads it."),
-]
+if TYPE_CHECKING:
+    from rich.table import Table
 
 
 def calibrate(
-    logs: TrialsArgument,
-    model: ModelOption = None,
-    map_file: MapOption = None,
-    simulator: SimulatorOption = None,
-    patch: PatchOption = None,
-    json: JsonOption = None,
-    seed: UnusedSeed = 0,
-    quiet: QuietOption = False,
-) -> None:
+    logs: opt.Trials, model: opt.RobotModel = None, map_file: opt.Map = None, simulator: opt.Simulator = None,
+    patch: opt.Patch = None, json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these leave open."""
     with Output("calibrate", json=json, seed=seed, quiet=quiet) as out:
         own = OwnSimulator(simulator, model, map_file, (), patch)
         if not own.given:
             raise InputError("--model", "missing", "--model XML --map MAP.toml, or --simulator FILE.py:NAME")
         own.check_alone({})
-        from simgap.robot_effects import UNMEASURED, effects_of
         from simgap.robots.calibrate import STAGES
         from simgap.robots.calibrate import calibrate as fitted
         from simgap.robots.patch import write_patch
 
         robot, recordings, loaded = read_logs(out, distinct_trials(logs), own)
-        more = () if loaded is None else loaded.effects(recordings)
         length = getattr(robot, "window", None) if loaded is None else loaded.map.length
-        wanted = (*UNMEASURED, *getattr(robot, "sd", ())) if loaded is not None else ()
-        effects = effects_of(robot, recordings, more, wanted)
+        effects = fitted_effects(robot, recordings, loaded)
         with show_stages(out, "calibrating", STAGES) as tell:
             found = fitted(robot, recordings, effects, length=length, tell=tell)
         warn_of_engine(out, own)
         document = found.body()
-        out.print(*tables(document))
-        for name, reason in document["reasons"].items():
-            out.print(f"{name}: {reason}")
+        out.print(*tables(document), *(f"{name}: {reason}" for name, reason in document["reasons"].items()))
         if patch is not None:
             changed = [n for n in found.point if not found.composed.numeric(n)]
             given = found.composed, found.point, document, changed, model
@@ -68,31 +46,20 @@ def calibrate(
 
 def tables(document: dict[str, Any]) -> list[Table]:
     """Parameters, what is determined only jointly, the simulation's own numbers, and held-out logs."""
-    from hmmseg.numbers import estimate, interval, shown_as
-
-    values = Table(title="parameters", title_justify="left")
-    for head in ("parameter", "the model has", "calibrated", "90 % interval"):
-        values.add_column(head, no_wrap=True)
     sums = [
         {"name": " + ".join(n if c == 1 else f"{c:.3g} {n}" for n, c in one["of"].items()), **one}
         for one in document["combinations"]
     ]
     named = [{"name": n, **p} for n, p in (document["parameters"] | document["numerics"]).items()]
+    rows = []
     for p in (*named, *sums):
-        shown = shown_as(p["unit"])
+        shown, known = shown_as(p["unit"]), ("undetermined", "")
         nominal = "" if "nominal" not in p else f"{shown[0] * p['nominal']:.4g} {shown[1]}"
-        if p["mean"] is None:
-            values.add_row(p["name"], nominal, "undetermined", "")
-        else:
-            told = (
-                estimate(p["mean"], p["sd"], shown),
-                interval(p["interval_90"][0], p["interval_90"][1], shown),
-            )
-            values.add_row(p["name"], nominal, *told)
-    rms = Table(title="free runs along held-out logs, rms", title_justify="left")
-    for head in ("channel", "as the model came", "calibrated"):
-        rms.add_column(head)
+        if p["mean"] is not None:
+            known = estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown)
+        rows.append((p["name"], nominal, *known))
+    heads = ("parameter", "the model has", "calibrated", "90 % interval")
     after = document["heldout"]["after"]
-    for name, before in document["heldout"]["before"].items():
-        rms.add_row(name, f"{before:.4g}", f"{after[name]:.4g}")
-    return [values, rms]
+    rms = [(n, f"{v:.4g}", f"{after[n]:.4g}") for n, v in document["heldout"]["before"].items()]
+    told = listed("free runs along held-out logs, rms", ("channel", "as the model came", "calibrated"), rms)
+    return [listed("parameters", heads, rows), told]

@@ -20,9 +20,8 @@ import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.console import Console
 from rich.segment import Segment
 from typer.core import TyperCommand, TyperGroup
@@ -31,29 +30,6 @@ import hmmseg
 from hmmseg.cache import CacheWarning
 from hmmseg.errors import InputError
 from hmmseg.io.formats import KINDS, kind_of, parts_of, split_part
-
-TrialsArgument = Annotated[list[Path], typer.Argument(
-    metavar="TRIAL...", help="Recordings (CSV, Parquet, NPZ, MCAP, ...); several are pooled.")]  # fmt: skip
-TaskArgument = Annotated[Path, typer.Argument(metavar="TASK", help="Task description (TOML).")]
-TaskOption = Annotated[Path, typer.Option("--task", metavar="T", help="Task description (TOML).")]
-RigOption = Annotated[Path, typer.Option("--rig", metavar="R", help="Nominal hand (TOML).")]
-TaskBeside = Annotated[Path | None, typer.Option(
-    "--task", metavar="T", help="Task description (TOML); task.toml next to the trials by default."
-)]  # fmt: skip
-RigBeside = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="Nominal hand (TOML); rig.toml next to the trials by default.")]  # fmt: skip
-ActualOption = Annotated[Path | None, typer.Option(
-    "--actual", metavar="A", help="Properties measured independently of the trials (TOML).")]  # fmt: skip
-JsonOption = Annotated[str | None, typer.Option(
-    "--json", metavar="FILE", help="Write the result as JSON; - is standard output.")]  # fmt: skip
-FiguresOption = Annotated[Path | None, typer.Option(
-    "--figures", metavar="DIR", help="Draw the figures into this folder.")]  # fmt: skip
-ReportOption = Annotated[Path | None, typer.Option(
-    "--report", metavar="FILE.html", help="Write one self-contained page.")]  # fmt: skip
-SeedOption = Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all random draws.")]
-UnusedSeed = Annotated[int, typer.Option("--seed", hidden=True, min=0)]  # taken, where nothing is random
-QuietOption = Annotated[bool, typer.Option(
-    "--quiet", help="Print nothing but errors; warnings are in the JSON.")]  # fmt: skip
 
 STANDARD_OUTPUT = "-"
 INPUT_SUFFIXES = (*KINDS, ".toml")
@@ -153,11 +129,12 @@ class Output:
             with self._console.unless_lost():
                 self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
 
-    def warn(self, text: str) -> None:
-        """Keep a warning for the JSON document and show it on standard error."""
-        self.warnings.append(text)
-        with self._side.unless_lost():
-            self._side.print(f"warning: {text}", highlight=False, markup=False, soft_wrap=True)
+    def warn(self, *texts: str) -> None:
+        """Keep warnings for the JSON document and show them on standard error."""
+        for text in texts:
+            self.warnings.append(text)
+            with self._side.unless_lost():
+                self._side.print(f"warning: {text}", highlight=False, markup=False, soft_wrap=True)
 
     def write(self, text: str) -> None:
         """Write to standard output as it is."""
@@ -320,10 +297,8 @@ def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any =
             f"rig.toml's [effects] ({', '.join(rig.effects)}) act in simulate alone; they are left out here"
         )
     for trial in found:
-        for warning in trial.warnings:
-            out.warn(warning)
-        for note in trial.notes:
-            out.print(note)
+        out.warn(*trial.warnings)
+        out.print(*trial.notes)
     return found
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from hmmseg_cli.console import JsonOption, Output, QuietOption, TaskArgument, UnusedSeed
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output
 
 
 def decompose(
-    task: TaskArgument, json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False
+    task: opt.TaskArgument, json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False
 ) -> None:
     """Subtasks, contact states, and the properties and signals each can reveal."""
     from hmmseg.contact.decompose import decompose as decompose_task

@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from hmmseg.example import example_folder
+from hmmseg.io.rig import read_rig
+from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli import diagnose, identify
-from hmmseg_cli.console import JsonOption, Output, QuietOption, SeedOption
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output
+from hmmseg_cli.options import Estimator
 
-DemoFigures = Annotated[Path, typer.Option("--figures", metavar="DIR", help="Folder for the figures.")]
 
-
-def demo(figures: DemoFigures = Path("demo"), json: JsonOption = None, seed: SeedOption = 0,
-         quiet: QuietOption = False) -> None:  # fmt: skip
+def demo(figures: opt.DemoFigures = Path("demo"), json: opt.Json = None, seed: opt.Seed = 0,
+         quiet: opt.Quiet = False) -> None:  # fmt: skip
     """Identify two blocks, then find out why rigid fingertips would measure them too narrow; see demo/."""
-    from hmmseg.io.rig import read_rig
-    from hmmseg.io.task import BlockTask, read_task
-
     page, finding = figures / "report.html", figures / "diagnosis.html"
     figures.mkdir(parents=True, exist_ok=True)
     with Output("demo", json=json, figures=figures, report=page, seed=seed, quiet=quiet) as out:
         folder = example_folder()
         trials, actual = sorted(folder.glob("trial_*.csv")), folder / "actual.toml"
         task, rig = read_task(folder / "task.toml"), read_rig(folder / "rig.toml")
-        body = identify.run(
-            out, trials, folder / "task.toml", folder / "rig.toml", identify.Method.BAYES, actual
-        )
+        body = identify.run(out, trials, folder / "task.toml", folder / "rig.toml", Estimator.BAYES, actual)
         assert isinstance(task, BlockTask)
         rigid = rig.fingertip.model_copy(update={"normal_stiffness": float("inf")})
         out.print("\nThe same recordings, with fingertips assumed rigid as in the paper:")

@@ -4,72 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
-from hmmseg.io.rig import Rig
-from hmmseg.io.task import BlockTask, read_task
+from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.task import BlockTask, SequenceTask, read_task
 from hmmseg.numbers import percent
-from hmmseg_cli.console import (
-    FiguresOption,
-    Grouped,
-    JsonOption,
-    Output,
-    QuietOption,
-    ReportOption,
-    RigBeside,
-    SeedOption,
-    TaskBeside,
-    TrialsArgument,
-    check_folder,
-    described,
-    distinct_trials,
-    needed,
-    read_trials,
-)
-from hmmseg_cli.diagnose_robot import (
-    CandidateOption,
-    HistoryOption,
-    MapOption,
-    MjcfOption,
-    OwnSimulator,
-    PatchOption,
-    RerunOption,
-    SimulatorOption,
-    compare_robot,
-    diagnose_robot,
-)
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Grouped, Output, check_folder, described, distinct_trials, needed, read_trials
+from hmmseg_cli.diagnose_robot import OwnSimulator, compare_robot, diagnose_robot
 from simgap.report.finding import plain_name, sentence, settles, tables
 
 if TYPE_CHECKING:
+    from estimation.report import Actual
+    from simgap.effect import Effect
     from simgap.gap.diagnose import Diagnosis
+    from simgap.generic.diagnose import GenericDiagnosis
 
-BLOCKS = "Blocks against the virtual model (what --task and --rig describe)"
-GIVEN = "Recordings against simulated trials of your own"
 EXAMPLES = """hmmseg diagnose trial_*.csv --report gap.html
 hmmseg diagnose log_*.csv --mjcf robot.xml --map map.toml --report gap.html --patch corrected/
 hmmseg diagnose new_*.csv --healthy old_*.csv --mjcf robot.xml --map map.toml
 hmmseg diagnose trial_*.csv --against simulated/trial_*.csv"""
-
-ActualOption = Annotated[Path | None, typer.Option(
-    "--actual", metavar="A", rich_help_panel=BLOCKS,
-    help="Properties measured independently of the trials (TOML).")]  # fmt: skip
-HealthyOption = Annotated[list[Path] | None, typer.Option(
-    "--healthy", metavar="TRIAL...",
-    help="Recordings known to be healthy, the best null; by default healthy twins are simulated. "
-    "With a model of a robot: its earlier logs, to find what changed.",
-)]  # fmt: skip
-AgainstOption = Annotated[list[Path] | None, typer.Option(
-    "--against", metavar="SIM...", rich_help_panel=GIVEN,
-    help="Simulated trials to compare with; a plain ordered task needs them.")]  # fmt: skip
-ModelFile = Annotated[Path | None, typer.Option(
-    "--model", metavar="M", rich_help_panel=GIVEN,
-    help="Emissions (.npz) of a plain ordered task, by hmmseg fit; or as --mjcf.")]  # fmt: skip
-EffectOption = Annotated[list[str] | None, typer.Option(
-    "--effect", metavar="NAME", help="The cause, instead of choosing one; repeated, they act together."
-)]  # fmt: skip
 LISTS = ("--against", "--healthy")  # options that take several files
 
 
@@ -90,27 +45,13 @@ class Diagnose(Grouped):
 
 
 def diagnose(
-    trials: TrialsArgument,
-    task: TaskBeside = None,
-    rig: RigBeside = None,
-    actual: ActualOption = None,
-    healthy: HealthyOption = None,
-    simulator: SimulatorOption = None,
-    mjcf: MjcfOption = None,
-    map_file: MapOption = None,
-    candidate: CandidateOption = None,
-    against: AgainstOption = None,
-    model: ModelFile = None,
-    effect: EffectOption = None,
-    patch: PatchOption = None,
-    history: HistoryOption = None,
-    rerun: RerunOption = None,
-    json: JsonOption = None,
-    figures: FiguresOption = None,
-    report: ReportOption = None,
-    seed: SeedOption = 0,
-    quiet: QuietOption = False,
-) -> None:
+    trials: opt.Trials, task: opt.TaskFound = None, rig: opt.RigFound = None, actual: opt.ActualBlocks = None,
+    healthy: opt.Healthy = None, simulator: opt.Simulator = None, mjcf: opt.Mjcf = None,
+    map_file: opt.Map = None, candidate: opt.Candidate = None, against: opt.Against = None,
+    model: opt.ModelOrEmissions = None, effect: opt.Effect = None, patch: opt.Patch = None,
+    history: opt.History = None, rerun: opt.Rerun = None, json: opt.Json = None, figures: opt.Figures = None,
+    report: opt.Report = None, seed: opt.Seed = 0, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """The gap between recordings and a simulation: where it lies, what causes it, how far it shrinks.
 
     Three models may be on the other side: the virtual blocks, your own model of a robot, or simulated trials.
@@ -125,8 +66,8 @@ def diagnose(
             if healthy:
                 refuse("does not go with --healthy and a model", {"--effect": effect, "--task": task})
                 compare_robot(out, paths, distinct_trials(healthy), own)
-                return
-            diagnose_robot(out, paths, own, task, effect or [])
+            else:
+                diagnose_robot(out, paths, own, task, effect or [])
             return
         task, rig = described(paths, task, rig)
         description = read_task(task)
@@ -137,8 +78,6 @@ def diagnose(
         if not isinstance(description, BlockTask):
             raise InputError(str(task), "a plain ordered task has no virtual model", "--against SIM")
         refuse("goes only with a plain ordered task", {"--model": model})
-        from hmmseg.io.rig import read_rig
-
         rig = needed(rig, paths)
         hand = read_rig(rig)
         if patch is not None:
@@ -184,14 +123,9 @@ def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:
 
 
 def run(
-    out: Output,
-    paths: Sequence[Path],
-    task: BlockTask,
-    rig: Rig,
-    actual: Path | None,
-    effect: Sequence[str],
+    out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig, actual: Path | None, effect: Sequence[str],
     healthy: Sequence[Path] = (),
-) -> Diagnosis:
+) -> Diagnosis:  # fmt: skip
     """Diagnose, and put table, figures and page where `out` has them go."""
     from estimation.report import read_actual
     from hmmseg.segmentation.align import align
@@ -201,78 +135,70 @@ def run(
 
     measured = None if actual is None else read_actual(actual, task.objects)
     recordings = read_trials(out, paths, rig)
-    well = read_trials(out, distinct_trials(list(healthy)), rig) if healthy else []
+    well = read_trials(out, distinct_trials(healthy), rig)
     with out.progress("diagnosing", total=STAGES) as advance:
-        tell = lambda text: advance(1)  # noqa: E731
-        found = find(
-            align(recordings, task, rig), measured, effect, out.seed, tell,
-            healthy=align(well, task, rig) if well else None,
-        )  # fmt: skip
-    for warning in found.warnings:
-        out.warn(warning)
+        null = align(well, task, rig) if well else None
+        aligned = align(recordings, task, rig)
+        found = find(aligned, measured, effect, out.seed, lambda _: advance(1), healthy=null)
     pads = rig.fingertip.model_dump()
     more = settles(found.body, measured is not None)
+    out.warn(*found.warnings)
     out.print(sentence(found.body, pads), *filter(None, [more]), *tables(found.body))
     _draw(out, found, [trial.name for trial in recordings], task, catalogue(), pads, measured)
     return found
 
 
 def _against(
-    out: Output, paths, against, task, rig_file: Path | None, effect: list[str], model_file: Path | None
-) -> None:
+    out: Output, paths: Sequence[Path], against: Sequence[Path], task: BlockTask | SequenceTask,
+    rig_file: Path | None, effect: Sequence[str], model_file: Path | None,
+) -> None:  # fmt: skip
     """The generic diagnosis, against given simulated trials."""
+    from hmmseg.sequence.model import load_model
     from simgap.generic.diagnose import diagnose as compare
     from simgap.generic.effects import effects
     from simgap.generic.trials import align, align_block_trials
 
-    every = distinct_trials([*paths, *against])
-    with out.progress("diagnosing", total=4) as advance:
-        tell = lambda text: advance(1)  # noqa: E731
+    hand, every, count = None, distinct_trials([*paths, *against]), len(paths)
+    if isinstance(task, BlockTask):
+        refuse("goes only with a plain ordered task", {"--model": model_file})
+        hand = read_rig(needed(rig_file, paths))
+    read = read_trials(out, every, hand, None if isinstance(task, BlockTask) else task)
+    with out.progress("diagnosing", total=3) as advance:
         if isinstance(task, BlockTask):
-            from hmmseg.io.rig import read_rig
-
-            refuse("goes only with a plain ordered task", {"--model": model_file})
-            hand = read_rig(needed(rig_file, paths))
-            read = read_trials(out, every, hand)
-            tell("aligning trials")
-            ensembles = align_block_trials(read[: len(paths)], read[len(paths) :], task, hand)
+            assert hand is not None
+            ensembles = align_block_trials(read[:count], read[count:], task, hand)
         else:
-            from hmmseg.sequence.model import load_model
-
-            read = read_trials(out, every, task=task)
             learned = None if model_file is None else load_model(model_file, task)
-            tell("aligning trials")
-            ensembles = align(read[: len(paths)], read[len(paths) :], task, learned)
-        found = compare(ensembles, effect, out.seed, tell)
-    for warning in found.warnings:
-        out.warn(warning)
+            ensembles = align(read[:count], read[count:], task, learned)
+        advance(1)
+        found = compare(ensembles, effect, out.seed, lambda _: advance(1))
+    out.warn(*found.warnings)
     out.print(sentence(found.body), *tables(found.body))
-    _draw(out, found, [trial.name for trial in read[: len(paths)]], task, effects())
+    _draw(out, found, [trial.name for trial in read[:count]], task, effects())
     out.finish(found.body)
 
 
 def _draw(
-    out: Output, found, files: Sequence[str], task, candidates: Mapping[str, Any],
-    pads: dict[str, float] | None = None, measured=None,
+    out: Output, found: Diagnosis | GenericDiagnosis, files: Sequence[str], task: BlockTask | SequenceTask,
+    candidates: Mapping[str, Effect], pads: Mapping[str, float] | None = None, measured: Actual | None = None,
 ) -> None:  # fmt: skip
     """Figures and page where wanted; `pads` of a diagnosis against the virtual model, which has them."""
     if out.figures is None and out.report is None:
         return
     from hmmseg.contact.decompose import subtasks
     from hmmseg_cli.pages import Setting, page
-    from simgap.report.figures import draw_all, draw_generic, draw_how_far, draw_signal
+    from simgap.report.figures import draw_all, draw_how_far, draw_signal
 
     body, names = found.body, list(dict.fromkeys(s.label for s in subtasks(task)))
-    signal = draw_generic if pads is None else draw_signal
 
     def draw(path: Callable[[str], Path]) -> None:
-        signal(found, path("gap_signal.png"))
+        draw_signal(found, path("gap_signal.png"))
         if body.get("shrinkage") and body["shrinkage"].get("before") is not None:
             draw_how_far(body, path("gap_before_after.png"))
 
     if out.figures is not None:
         draw_all(body, names, out.figure)
-        signal(found, out.figure("gap_signal.png"))
+        draw_signal(found, out.figure("gap_signal.png"))
     if out.report is not None:
         shows = {name: candidate.shows for name, candidate in candidates.items()}
         setting = Setting(files, names, pads or {}, measured, shows, out.warnings)

@@ -10,17 +10,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
-from rich.table import Table
+from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
+from hmmseg.tables import listed
 from hmmseg_cli.console import Output, check_file, check_folder, strict_json
 from simgap.report.finding import sentence
 from simgap.report.finding import tables as usual_tables
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from simgap.progress import Progress
     from simgap.robot_effects.base import RobotEffect
     from simgap.robots.changes import Changes
@@ -28,41 +28,6 @@ if TYPE_CHECKING:
     from simgap.simulators.mjcf.load import Loaded
     from simgap.simulators.protocol import Simulator
     from simgap.simulators.recording import Recording
-
-ROBOT = "A robot against your own model of it"
-
-
-def _option(flag: str, metavar: str, text: str) -> Any:
-    return typer.Option(flag, metavar=metavar, rich_help_panel=ROBOT, help=text)
-
-
-SimulatorOption = Annotated[
-    str | None, _option("--simulator", "FILE.py:NAME", "Your own model instead of the virtual blocks.")
-]
-MjcfOption = Annotated[
-    Path | None, _option("--mjcf", "XML", "Your own model, as MuJoCo reads it; it needs --map.")
-]
-MapOption = Annotated[
-    Path | None,
-    _option("--map", "MAP.toml", "Which column of the logs is which joint, actuator, sensor "
-            "or body of the MJCF model, in what unit."),
-]  # fmt: skip
-CandidateOption = Annotated[
-    list[str] | None,
-    _option("--candidate", "NAME", "Add a parameter of the MJCF model to the candidates, such as "
-            "joint:elbow.frictionloss."),
-]  # fmt: skip
-HistoryOption = Annotated[
-    Path | None,
-    _option("--history", "FILE.jsonl", "Add this run's intervals to that file, and say what has moved."),
-]
-RerunOption = Annotated[
-    Path | None, _option("--rerun", "FILE.rrd", "Recorded, simulated and corrected, for Rerun's viewer.")
-]
-PatchOption = Annotated[
-    Path | None,
-    typer.Option("--patch", metavar="DIR", help="Write the corrected model and its ranges into this folder."),
-]
 
 
 @dataclass(frozen=True)
@@ -132,9 +97,19 @@ def read_logs(
         assert own.mjcf is not None and own.map_file is not None
         loaded = load_mjcf(own.mjcf, own.map_file, own.candidates)
         simulator, logs = loaded.simulator, [loaded.read(path) for path in paths]
-    for warning in (*(() if loaded is None else loaded.warnings), *(w for log in logs for w in log.warnings)):
-        out.warn(warning)
+    out.warn(*(() if loaded is None else loaded.warnings), *(w for log in logs for w in log.warnings))
     return simulator, logs, loaded
+
+
+def fitted_effects(
+    simulator: Simulator, logs: Sequence[Recording], loaded: Loaded | None
+) -> dict[str, RobotEffect]:
+    """What is fitted to logs before anything else is asked: of an MJCF all that is rarely measured."""
+    from simgap.robot_effects import UNMEASURED, effects_of
+
+    if loaded is None:
+        return effects_of(simulator, logs)
+    return effects_of(simulator, logs, loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
 
 
 @contextmanager
@@ -167,16 +142,11 @@ def warn_of_engine(out: Output, own: OwnSimulator) -> None:
     if own.mjcf is not None:
         from simgap.simulators.mjcf.engine import warned
 
-        for line in warned():
-            out.warn(line)
+        out.warn(*warned())
 
 
 def diagnose_robot(
-    out: Output,
-    paths: Sequence[Path],
-    own: OwnSimulator,
-    task: Path | None,
-    effect: Sequence[str],
+    out: Output, paths: Sequence[Path], own: OwnSimulator, task: Path | None, effect: Sequence[str]
 ) -> None:
     """Read, diagnose, and put table, figures, page, patch and document where `out` has them go."""
     from simgap.robots.describe import body
@@ -192,17 +162,9 @@ def diagnose_robot(
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
     with show_stages(out, "diagnosing", STAGES) as tell:
-        found = diagnose(
-            at_risk,
-            recordings,
-            forced=tuple(dict.fromkeys(effect)),
-            seed=out.seed,
-            more=more,
-            length=length,
-            phases=phases,
-            tell=tell,
-            warn=out.warn,
-        )
+        forced = tuple(dict.fromkeys(effect))
+        found = diagnose(at_risk, recordings, forced=forced, seed=out.seed, more=more, length=length,
+                         phases=phases, tell=tell, warn=out.warn)  # fmt: skip
     document = body(found)
     warn_of_engine(out, own)
     said, left = sentence(document), document["remainder"]["rms_over_noise"]
@@ -221,14 +183,10 @@ def diagnose_robot(
 
 def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], own: OwnSimulator) -> None:
     """What changed of a robot since its `healthy` logs: table, figure, page, patch and document."""
-    from simgap.robot_effects import UNMEASURED, effects_of
     from simgap.robots.changes import STAGES, changes
 
     simulator, logs, loaded = read_logs(out, [*paths, *healthy], own)
-    if loaded is None:
-        effects = effects_of(simulator, logs)
-    else:
-        effects = effects_of(simulator, logs, loaded.effects(logs), (*UNMEASURED, *loaded.map.sd))
+    effects = fitted_effects(simulator, logs, loaded)
     with show_stages(out, "comparing", STAGES) as tell:
         found = changes(simulator, logs[len(paths) :], logs[: len(paths)], effects, tell=tell)
     warn_of_engine(out, own)
@@ -257,14 +215,9 @@ def _patch(out: Output, own: OwnSimulator, composed: Any, point: Any, document: 
 
 
 def _deliver(
-    out: Output,
-    own: OwnSimulator,
-    found: RobotDiagnosis | Changes,
-    document: dict[str, Any],
-    loaded: Loaded | None,
-    logs: Sequence[Recording],
-    effects: Mapping[str, RobotEffect],
-) -> None:
+    out: Output, own: OwnSimulator, found: RobotDiagnosis | Changes, document: dict[str, Any],
+    loaded: Loaded | None, logs: Sequence[Recording], effects: Mapping[str, RobotEffect],
+) -> None:  # fmt: skip
     """History, the motion to run next, courses for Rerun, figures and the page."""
     from simgap.report import robot
     from simgap.robots.changes import Changes
@@ -317,39 +270,27 @@ def _history(said: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
     """What moved since each parameter was known last, as a table."""
     if not said:
         return [f"the history begins with this run: {len(now)} parameters"]
-    table = Table(title="since it was known last", title_justify="left")
-    for head in ("parameter", "then", "now", "since", ""):
-        table.add_column(head)
+    rows = []
     for name, p in said.items():
-        ends = [("" if v is None else f"{v:.4g} {p['unit']}") for v in (p["then"], p["now"])]
-        table.add_row(name, *ends, p["since"], p["says"])
-    return [table]
+        ends = ("" if v is None else f"{v:.4g} {p['unit']}" for v in (p["then"], p["now"]))
+        rows.append((name, *ends, p["since"], p["says"]))
+    return [listed("since it was known last", ("parameter", "then", "now", "since", ""), rows, wraps=True)]
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     """What the logs leave open first, then the tables of every diagnosis, and held-out residuals."""
-    out = []
-    unseen = document["identifiability"]["unseen"]
-    alike = document["identifiability"]["alike"]
-    if unseen or alike:
-        table = Table(title="what these logs leave open", title_justify="left", show_header=False)
-        for one in alike[:6]:
-            how = "act only together" if one["exact"] else f"are alike but for {100 * one['own']:.1f} %"
-            table.add_row(", ".join(one["parameters"]), how)
-        if unseen:
-            table.add_row(", ".join(unseen[:8]), "cannot be seen")
-        out.append(table)
-    out += usual_tables(dict(document))
+    rows, unseen = [], document["identifiability"]["unseen"]
+    for one in document["identifiability"]["alike"][:6]:
+        how = "act only together" if one["exact"] else f"are alike but for {100 * one['own']:.1f} %"
+        rows.append((", ".join(one["parameters"]), how))
+    rows += [(", ".join(unseen[:8]), "cannot be seen")] if unseen else []
+    out = [listed("what these logs leave open", (), rows)] if rows else []
+    out += usual_tables(document)
     if document["shrinkage"] is not None:
-        rms = Table(title=f"residual on {document['shrinkage']['evaluated_on']}, rms", title_justify="left")
-        for head in ("channel", "before", "after", "noise"):
-            rms.add_column(head, justify="left" if head == "channel" else "right")
-        for name, v in document["shrinkage"]["rms"].items():
-            rms.add_row(
-                f"{name} [{v['unit']}]",
-                f"{v['before']:.4g}",
-                f"{v['after']:.4g}",
-                f"{found.composed.noise[name]:.2g}",
-            )
-        out.append(rms)
+        heads = ("channel", "before", "after", "noise")
+        noise, rows = found.composed.noise, []
+        for n, v in document["shrinkage"]["rms"].items():
+            rows.append((f"{n} [{v['unit']}]", f"{v['before']:.4g}", f"{v['after']:.4g}", f"{noise[n]:.2g}"))
+        title = f"residual on {document['shrinkage']['evaluated_on']}, rms"
+        out.append(listed(title, heads, rows, right=heads[1:]))
     return out

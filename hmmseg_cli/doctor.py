@@ -13,10 +13,11 @@ from typing import Any
 from rich.table import Table
 
 import hmmseg
-from hmmseg_cli.console import JsonOption, Output, QuietOption
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output
 
 
-def doctor(json: JsonOption = None, quiet: QuietOption = False) -> None:
+def doctor(json: opt.Json = None, quiet: opt.Quiet = False) -> None:
     """Versions, extras, caches and JAX's device of this installation, for a report of a fault."""
     with Output("doctor", json=json, quiet=quiet) as out:
         found = examined()

@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from hmmseg.tables import listed
-from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output
 
 if TYPE_CHECKING:
     from simgap.effects.base import HandEffect
 
 
-def effects(json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False) -> None:
+def effects(json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False) -> None:
     """The candidate effects, their parameters, priors and signatures."""
     with Output("effects", json=json, seed=seed, quiet=quiet) as out:
         from simgap.effects import catalogue

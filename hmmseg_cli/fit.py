@@ -9,35 +9,18 @@ from __future__ import annotations
 import csv
 import json as jsonlib
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from hmmseg.errors import InputError
+from hmmseg.io.rig import read_rig
 from hmmseg.io.task import SequenceTask, read_task
-from hmmseg_cli.console import (
-    JsonOption,
-    Output,
-    QuietOption,
-    RigBeside,
-    TaskBeside,
-    TrialsArgument,
-    UnusedSeed,
-    check_file,
-    described,
-    distinct_trials,
-    read_trials,
-)
-
-LabelsOption = Annotated[Path | None, typer.Option(
-    "--labels", metavar="FILE|DIR",
-    help="What is known of some boundaries: a folder with NAME.json, or a .csv file.")]  # fmt: skip
-ModelOption = Annotated[Path, typer.Option("--model", metavar="M.npz", help="Where the model is written.")]
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output, check_file, described, distinct_trials, read_trials
 
 
 def fit(
-    trials: TrialsArgument, model: ModelOption, task: TaskBeside = None, rig: RigBeside = None,
-    labels: LabelsOption = None, json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False,
+    trials: opt.Trials, model: opt.ModelToWrite, task: opt.TaskFound = None, rig: opt.RigFound = None,
+    labels: opt.KnownLabels = None, json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Learn emissions and durations of a plain ordered task, with or without labels."""
     with Output("fit", json=json, seed=seed, quiet=quiet) as out:
@@ -52,23 +35,15 @@ def fit(
         from hmmseg.sequence.model import save_model
         from hmmseg.sequence.segment import SURE
 
-        hand = None
-        if rig is not None:
-            from hmmseg.io.rig import read_rig
-
-            hand = read_rig(rig)
-        recordings = read_trials(out, paths, hand, description)
+        recordings = read_trials(out, paths, None if rig is None else read_rig(rig), description)
         names = [trial.name for trial in recordings]
         known = {} if labels is None else read_labels_given(labels, names)
         learned = fit_sequence(recordings, description, known)
         save_model(learned, out.stage(model))
         out.print(f"learned {len(description.sequence)} states from {len(recordings)} trials, {len(known)} "
                   f"of them labelled; written to {model}")  # fmt: skip
-        doubtful = [
-            f"{name} ({sure:.2f})"
-            for name, sure in zip(description.sequence[1:], learned.sure, strict=False)
-            if sure < SURE
-        ]
+        begins = zip(description.sequence[1:], learned.sure, strict=False)
+        doubtful = [f"{name} ({sure:.2f})" for name, sure in begins if sure < SURE]
         if doubtful:
             out.warn(
                 "the trials can be read in several ways; the probability of where these begin: "

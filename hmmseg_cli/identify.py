@@ -3,48 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
+from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, read_task
-from hmmseg_cli.console import (
-    ActualOption,
-    FiguresOption,
-    JsonOption,
-    Output,
-    QuietOption,
-    ReportOption,
-    RigBeside,
-    SeedOption,
-    TaskBeside,
-    TrialsArgument,
-    described,
-    distinct_trials,
-    needed,
-    read_trials,
-)
-from hmmseg_cli.segment import warn_of_misfit
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output, described, distinct_trials, needed, read_trials
+from hmmseg_cli.options import Estimator
+from hmmseg_cli.segment import warn_of_misfits
 
-
-class Method(StrEnum):
-    """How properties are estimated."""
-
-    BAYES = "bayes"
-    PAPER = "paper"
-
-
-MethodOption = Annotated[Method, typer.Option(help="Bayesian, or the paper's thresholds and formulas.")]
+if TYPE_CHECKING:
+    from estimation.identification import Identification
+    from hmmseg.io.trial import Trial
+    from hmmseg.segmentation.spans import Segmentation
 
 
 def identify(
-    trials: TrialsArgument, task: TaskBeside = None, rig: RigBeside = None,
-    method: MethodOption = Method.BAYES, actual: ActualOption = None, json: JsonOption = None,
-    figures: FiguresOption = None, report: ReportOption = None, seed: SeedOption = 0,
-    quiet: QuietOption = False,
+    trials: opt.Trials, task: opt.TaskFound = None, rig: opt.RigFound = None,
+    method: opt.IdentifyMethod = Estimator.BAYES, actual: opt.Actual = None, json: opt.Json = None,
+    figures: opt.Figures = None, report: opt.Report = None, seed: opt.Seed = 0, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
@@ -53,61 +32,64 @@ def identify(
 
 
 def run(
-    out: Output, trials: Sequence[Path], task: Path, rig: Path, method: Method, actual: Path | None
+    out: Output, trials: Sequence[Path], task: Path, rig: Path, method: Estimator, actual: Path | None
 ) -> dict[str, Any]:
     """Identify, put table, figures and page where `out` has them go, and give the document."""
     paths = distinct_trials(trials)
     description = read_task(task)
     if not isinstance(description, BlockTask):
         raise InputError(str(task), "a plain ordered task has no blocks to identify", "objects and moves")
-    from estimation.report import properties_table, read_actual
-    from hmmseg.hand.signals import task_space
-    from hmmseg.io.rig import read_rig
+    from estimation.report import compare, disagreements, properties_table, read_actual
 
     hand = read_rig(rig)
     measured = None if actual is None else read_actual(actual, description.objects)
     recordings = read_trials(out, paths, hand)
-    signals = [task_space(trial, hand) for trial in recordings]
-    if method is Method.PAPER:
-        body, segmentations, found = _paper(out, signals, recordings, description)
+    found = None
+    if method is Estimator.PAPER:
+        body, segmentations = _paper(out, recordings, description, hand)
     else:
         found = _bayes(out, recordings, description, hand)
         body, segmentations = found.to_json(), found.segmentations
     if measured is not None:
-        from estimation.report import compare, disagreements
-
         body["actual"] = compare(body["properties"], measured, hand.tolerance.property or 0.0)
-        for line in disagreements(body["properties"], body["actual"]):
-            out.warn(line)
-    out.print(properties_table(body, measured))
-    for key, reason in body["reasons"].items():
-        out.print(f"{key}: {reason}")
-    for note in body.get("notes", ()):
-        out.print(note)
+        out.warn(*disagreements(body["properties"], body["actual"]))
+    reasons = (f"{key}: {reason}" for key, reason in body["reasons"].items())
+    out.print(properties_table(body, measured), *reasons, *body.get("notes", ()))
     if out.figures is not None:
-        _draw(out, signals, recordings, segmentations, body, found, measured)
+        from estimation.plots import draw_check, draw_corner, draw_estimates
+
+        for i, (trial, segmentation) in enumerate(zip(recordings, segmentations, strict=True)):
+            segmentation.plot(out.figure(f"{Path(trial.name).stem}_segments.png"))
+            if found is not None:
+                draw_check(found, i, out.figure(f"{Path(trial.name).stem}_predictive.png"))
+        draw_estimates(body["properties"], measured, out.figure("estimates.png"))
+        if found is not None and found.names:
+            draw_corner(found.draws, found.names, out.figure("corner.png"), measured)
     if out.report is not None:
         from hmmseg_cli.pages import identification_page
 
-        page = identification_page(signals, recordings, segmentations, body, found, measured, out.warnings)
+        page = identification_page(recordings, segmentations, body, found, measured, out.warnings)
         out.stage(out.report).write_text(page, encoding="utf-8")
     return body
 
 
-def _paper(out: Output, signals, recordings, task: BlockTask):
+def _paper(
+    out: Output, recordings: Sequence[Trial], task: BlockTask, hand: Rig
+) -> tuple[dict[str, Any], list[Segmentation]]:
+    """The paper's thresholds and formulas: the document's body, and the segmentations."""
     from estimation.paper_formulas import estimate_plugin
+    from hmmseg.hand.signals import task_space
     from hmmseg.segmentation.thresholds import segment_qualitative
 
+    signals = [task_space(trial, hand) for trial in recordings]
     pairs = zip(recordings, signals, strict=True)
     segmentations = [segment_qualitative(trial, s, task) for trial, s in pairs]
-    for segmentation in segmentations:
-        warn_of_misfit(out, segmentation)
-    estimates = estimate_plugin(signals, segmentations, task)
+    warn_of_misfits(out, segmentations)
     body = {"trials": [s.to_json() for s in segmentations], "method": "paper", "sampler": None}
-    return body | estimates.to_json(), segmentations, None
+    return body | estimate_plugin(signals, segmentations, task).to_json(), segmentations
 
 
-def _bayes(out: Output, recordings, task: BlockTask, hand):
+def _bayes(out: Output, recordings: Sequence[Trial], task: BlockTask, hand: Rig) -> Identification:
     from estimation.identification import identify_aligned
     from hmmseg.segmentation.align import align
 
@@ -121,24 +103,5 @@ def _bayes(out: Output, recordings, task: BlockTask, hand):
             done = 100 * step // of
 
         found = identify_aligned(aligned, out.seed, progress)
-    for warning in found.warnings:
-        out.warn(warning)
+    out.warn(*found.warnings)
     return found
-
-
-def _draw(
-    out: Output, signals: Sequence[Any], trials: Sequence[Any], segmentations: Sequence[Any],
-    body: dict[str, Any], found: Any, actual: Any,
-) -> None:  # fmt: skip
-    """Signals with subtasks a trial, estimates, and of a Bayesian result corner and predictive check."""
-    from estimation.plots import draw_check, draw_corner, draw_estimates
-    from hmmseg.plot.signals import draw_signals
-
-    for i, (s, trial, segmentation) in enumerate(zip(signals, trials, segmentations, strict=True)):
-        stem = Path(trial.name).stem
-        draw_signals(s, segmentation, out.figure(f"{stem}_segments.png"))
-        if found is not None:
-            draw_check(found, i, out.figure(f"{stem}_predictive.png"))
-    draw_estimates(body["properties"], actual, out.figure("estimates.png"))
-    if found is not None and found.names:
-        draw_corner(found.draws, found.names, out.figure("corner.png"), actual)

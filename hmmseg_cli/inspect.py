@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.schema import parse_toml
 from hmmseg.tables import listed
-from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed, check_file
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output, check_file
 
-FilesArgument = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of any kind.")]
-RigFile = Annotated[Path | None, typer.Option(
-    "--rig", metavar="R", help="Judge the recording with this hand and its mapping.")]  # fmt: skip
-WriteOption = Annotated[Path | None, typer.Option(
-    "--write", metavar="RIG.toml", help="Add the proposed mapping to this rig, or make it.")]  # fmt: skip
+if TYPE_CHECKING:
+    from hmmseg.hand.inspect import Inspection
+
 BARS = "▁▂▃▄▅▆▇█"
 # Names that `hmmseg new` gives a gripper's columns until somebody says which they are.
 LAID_OUT = {"x", "y", "z", "opening", "fx", "fy", "fz", "tx", "ty", "tz"}
 
 
 def inspect(
-    files: FilesArgument, rig: RigFile = None, write: WriteOption = None, json: JsonOption = None,
-    seed: UnusedSeed = 0, quiet: QuietOption = False,
+    files: opt.Files, rig: opt.JudgingRig = None, write: opt.WrittenRig = None, json: opt.Json = None,
+    seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """What a recording contains, and the [columns] or [topics] that would read it."""
     from hmmseg.hand.inspect import inspect as look
@@ -42,7 +40,7 @@ def inspect(
         out.finish({"files": [_document(each) for each in found]})
 
 
-def extended(rig_file: Path, found: list[Any]) -> str:
+def extended(rig_file: Path, found: Sequence[Inspection]) -> str:
     """The rig's text with the mapping added; InputError where there is one, or none to add."""
     proposed = list(dict.fromkeys(each.toml for each in found if each.toml))
     if not proposed:
@@ -71,7 +69,7 @@ def extended(rig_file: Path, found: list[Any]) -> str:
     return text
 
 
-def _show(out: Output, found: Any) -> None:
+def _show(out: Output, found: Inspection) -> None:
     head = f"{found.file}: {found.samples} samples"
     if found.rate is not None:
         head += f" at {found.rate:.4g} Hz, {found.end - found.start:.4g} s"
@@ -86,31 +84,22 @@ def _show(out: Output, found: Any) -> None:
          _number(c.minimum), _number(c.maximum), sparkline(c.course)) for c in found.channels
     ]  # fmt: skip
     out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
-    for line in found.said:
-        out.warn(line)
+    out.warn(*found.said)
+    then = f"hmmseg segment {found.file} --task task.toml"
     if found.toml:
         out.print("proposed for rig.toml:")
-        out.print(found.toml, whole=True)
-        out.print(f"next: hmmseg inspect {found.file} --write rig.toml, or copy it there", whole=True)
+        said = f"{found.toml}\nnext: hmmseg inspect {found.file} --write rig.toml, or copy it there"
     elif not found.understood:
-        out.print(
-            f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
-            "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"
-            f'sequence = ["...", "..."] in task.toml, then: hmmseg segment {found.file} --task task.toml',
-            whole=True,
-        )
+        said = (f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
+                "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"
+                f'sequence = ["...", "..."] in task.toml, then: {then}')  # fmt: skip
     else:
-        out.print(f"{found.file}: all columns understood; next: hmmseg segment {found.file} --task task.toml "
-                  "--rig rig.toml", whole=True)  # fmt: skip
+        said = f"{found.file}: all columns understood; next: {then} --rig rig.toml"
+    out.print(said, whole=True)
 
 
 def _number(value: float | None) -> str:
     return "" if value is None else f"{value:.4g}"
-
-
-def _share(value: float, low: float, high: float) -> float:
-    """Where a value lies between two, whose difference may be beyond all numbers."""
-    return (value / 2 - low / 2) / (high / 2 - low / 2)
 
 
 def sparkline(course: tuple[float, ...]) -> str:
@@ -118,22 +107,17 @@ def sparkline(course: tuple[float, ...]) -> str:
     there = [value for value in course if value == value]
     if not there:
         return ""
-    low, high = min(there), max(there)
-    return "".join(
-        " " if value != value else BARS[0 if low == high else min(7, int(8 * _share(value, low, high)))]
-        for value in course
-    )
+    low, high = min(there) / 8, max(there) / 8  # the difference of two numbers may be beyond all of them
+    steps = [int(8 * (v / 8 - low) / (high - low)) if v == v and high > low else 0 for v in course]
+    return "".join(" " if v != v else BARS[min(7, k)] for v, k in zip(course, steps, strict=True))
 
 
-def _document(found: Any) -> dict[str, Any]:
-    channels = [
-        {"name": c.name, "unit": c.unit, "rate": c.rate, "samples": c.samples, "missing": c.missing,
-         "interpolated": c.interpolated, "minimum": c.minimum, "maximum": c.maximum, "text": c.text}
-        for c in found.channels
-    ]  # fmt: skip
+def _document(found: Inspection) -> dict[str, Any]:
+    names = ("name", "unit", "rate", "samples", "missing", "interpolated", "minimum", "maximum", "text")
     return {
         "file": found.file, "recordings": found.parts, "samples": found.samples, "start": found.start,
         "end": found.end, "rate": found.rate, "origin_ns": found.origin,
-        "gaps": [{"start": start, "end": end} for start, end in found.gaps], "channels": channels,
+        "gaps": [{"start": start, "end": end} for start, end in found.gaps],
+        "channels": [{name: getattr(c, name) for name in names} for c in found.channels],
         "mapping": found.mapping, "toml": found.toml or None, "findings": found.said,
     }  # fmt: skip

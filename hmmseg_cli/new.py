@@ -2,54 +2,44 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
-from hmmseg_cli.console import JsonOption, Output, QuietOption, UnusedSeed, check_folder
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output, check_folder
 from hmmseg_cli.inspect import extended
+from hmmseg_cli.options import Hand
+
+if TYPE_CHECKING:
+    from hmmseg.hand.inspect import Inspection
 
 
-class Hand(StrEnum):
-    """Kinds of hand that a rig describes."""
-
-    CARTESIAN = "cartesian"
-    JOINTED = "jointed"
-    GRIPPER = "gripper"
-    NONE = "none"
-
-
-HandOption = Annotated[Hand | None, typer.Option(
-    "--hand", help="Fingertips, two-link fingers, a gripper, or none (a plain ordered task).")]  # fmt: skip
-FolderArgument = Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the files are written.")]
-FromOption = Annotated[Path | None, typer.Option(
-    "--from", metavar="FILE", help="Fill in hand, rate and columns from this recording."
-)]  # fmt: skip
-MjcfFile = Annotated[Path | None, typer.Option(
-    "--mjcf", metavar="XML", help="Lay out a map.toml of this model and a log (--from).")]  # fmt: skip
-
-
-def new(folder: FolderArgument, hand: HandOption = None, source: FromOption = None, mjcf: MjcfFile = None,
-        json: JsonOption = None, seed: UnusedSeed = 0, quiet: QuietOption = False) -> None:  # fmt: skip
+def new(
+    folder: opt.Folder, hand: opt.HandKind = None, source: opt.Source = None, mjcf: opt.LaidOutModel = None,
+    json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
     """A commented rig.toml and task.toml, filled in from a recording or to fill in; or a robot's map.toml."""
     from jinja2 import Environment, PackageLoader
 
     with Output("new", json=json, seed=seed, quiet=quiet) as out:
         check_folder("FOLDER", folder)
-        if mjcf is not None:
-            out.finish({"files": [_map(out, folder / "map.toml", mjcf, source)], "hand": None})
-            return
+        targets = [folder / name for name in (("rig.toml", "task.toml") if mjcf is None else ("map.toml",))]
+        if mjcf is not None and source is None:
+            raise InputError("--mjcf", "needs a log", "--from LOG")
         from hmmseg.hand.inspect import inspect as look
 
         looked = None if source is None else look(source)
-        targets = [folder / "rig.toml", folder / "task.toml"]
         for path in targets:
-            _free(path)
+            if path.exists():
+                raise InputError(str(path), "is there already and would be written over", "another folder")
+        if mjcf is not None:
+            assert looked is not None and source is not None
+            _lay_out_map(out, targets[0], mjcf, source, looked)
+            out.finish({"files": [str(targets[0])], "hand": None})
+            return
         hand, rate = (hand or Hand.CARTESIAN, 50.0) if looked is None else _seen(hand, looked)
         pages = Environment(loader=PackageLoader("hmmseg_cli"), keep_trailing_newline=True, autoescape=False)
         for path, read in zip(targets, (read_rig, read_task), strict=True):
@@ -67,12 +57,7 @@ def new(folder: FolderArgument, hand: HandOption = None, source: FromOption = No
         out.finish({"files": [str(path) for path in targets], "hand": hand.value})
 
 
-def _free(path: Path) -> None:
-    if path.exists():
-        raise InputError(str(path), "is there already and would be written over", "another folder")
-
-
-def _seen(hand: Hand | None, looked: Any) -> tuple[Hand, float]:
+def _seen(hand: Hand | None, looked: Inspection) -> tuple[Hand, float]:
     """The hand and its rate [Hz], from what a recording has."""
     names = {channel.name for channel in looked.channels} | set(looked.mapping or ())
     if hand is None and "[gripper]" in looked.toml:
@@ -83,18 +68,12 @@ def _seen(hand: Hand | None, looked: Any) -> tuple[Hand, float]:
     return hand, float(f"{looked.rate or 50.0:.4g}")
 
 
-def _map(out: Output, path: Path, mjcf: Path, source: Path | None) -> str:
+def _lay_out_map(out: Output, path: Path, mjcf: Path, source: Path, looked: Inspection) -> None:
     """Lay out a map.toml: columns of a log with the parts of a model whose names they hold."""
-    from hmmseg.hand.inspect import inspect as look
     from simgap.simulators.mjcf.map import proposed_map
 
-    if source is None:
-        raise InputError("--mjcf", "needs a log", "--from LOG")
-    _free(path)
-    columns = [(c.name, c.unit) for c in look(source).channels if not c.text]
-    text, open_columns = proposed_map(mjcf, columns)
+    text, open_columns = proposed_map(mjcf, [(c.name, c.unit) for c in looked.channels if not c.text])
     out.stage(path).write_text(text, encoding="utf-8")
     left = f"; columns left to you: {', '.join(open_columns)}" if open_columns else ""
     out.print(f"wrote {path}{left}")
     out.print(f"then: hmmseg diagnose {source} --mjcf {mjcf} --map {path} --report gap.html")
-    return str(path)

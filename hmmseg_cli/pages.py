@@ -15,7 +15,6 @@ import hmmseg
 from estimation.identification import Identification
 from estimation.plots import draw_check, draw_corner, draw_estimates
 from estimation.report import Actual
-from hmmseg.hand.signals import Signals
 from hmmseg.io.trial import Trial
 from hmmseg.numbers import (
     SHOWN,
@@ -28,7 +27,6 @@ from hmmseg.numbers import (
     property_shown_as,
     shown_as,
 )
-from hmmseg.plot.signals import draw_signals
 from hmmseg.segmentation.spans import Segmentation
 from simgap.report import finding
 from simgap.report.finding import plain_name
@@ -46,81 +44,66 @@ def rendered(template: str, **values: Any) -> str:
     return environment.get_template(template).render(version=hmmseg.__version__, **values)
 
 
-def embedded(path: Path) -> str:
-    """A PNG as a data URL."""
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+def embedded(draw: Callable[[Callable[[str], Path]], Any]) -> dict[str, str]:
+    """PNGs that `draw` draws at the paths that it is given for their names, by stem as data URLs."""
+    with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
+        draw(lambda name: Path(folder) / name)
+        return {
+            p.stem: "data:image/png;base64," + base64.b64encode(p.read_bytes()).decode()
+            for p in sorted(Path(folder).iterdir())
+        }
+
+
+def _picture(draw: Callable[..., Any], caption: str, *args: Any, **more: Any) -> dict[str, str]:
+    """A figure with its caption; `draw` takes its path last."""
+    (data,) = embedded(lambda path: draw(*args, path("figure.png"), **more)).values()
+    return {"data": data, "caption": caption}
 
 
 def identification_page(
-    signals: Sequence[Signals], trials: Sequence[Trial], segmentations: Sequence[Segmentation],
-    body: dict[str, Any], found: Identification | None, measured: Actual | None, warnings: Sequence[str],
+    trials: Sequence[Trial], segmentations: Sequence[Segmentation], body: dict[str, Any],
+    found: Identification | None, measured: Actual | None, warnings: Sequence[str],
 ) -> str:  # fmt: skip
     """HTML of one identification."""
-    figures = [
-        picture(
-            lambda p: draw_estimates(body["properties"], measured, p), "Estimates with 68 and 95 % intervals"
-        )
-    ]
+    what = "Estimates with 68 and 95 % intervals"
+    figures = [_picture(draw_estimates, what, body["properties"], measured)]
     if found is not None and found.names:
-        draws, names = found.draws, found.names
-        figures.append(
-            picture(lambda p: draw_corner(draws, names, p, measured), "Posterior of all properties")
-        )
+        drawn = found.draws, found.names
+        figures.append(_picture(draw_corner, "Posterior of all properties", *drawn, actual=measured))
+    shown = []
+    for i, (trial, segmentation) in enumerate(zip(trials, segmentations, strict=True)):
+        pictures = [_picture(segmentation.plot, "Signals with subtasks and boundaries")]
+        if found is not None:
+            pictures.append(_picture(draw_check, "Recorded samples in their predicted bands", found, i))
+        evidence = segmentation.log_evidence
+        spans = [
+            (s.label, s.state, f"{s.start:.3f}",
+             f"{s.start_90[0]:.3f} to {s.start_90[1]:.3f}" if s.start_sd else "", f"{s.end:.3f}")
+            for s in segmentation.spans
+        ]  # fmt: skip
+        shown.append({
+            "name": trial.name, "rate": f"{segmentation.rate:.4g}", "complete": segmentation.complete,
+            "log_evidence": "none" if evidence is None else f"{evidence:.1f}", "figures": pictures,
+            "spans": spans,
+        })  # fmt: skip
+    checks = [
+        (name, plain(check["p_value"], 2),
+         estimate(check["scatter_between_grips"], 0, shown_as("N" if name == "force" else "m")))
+        for name, check in (body.get("predictive") or {}).items()
+    ]  # fmt: skip
     return rendered(
         "identify.html.j2", method=body["method"], objects=list(body["properties"]),
         verdict=[_verdict(obj, entry) for obj, entry in body["properties"].items()],
         warnings=warnings, measured=measured is not None, rows=_rows(body, measured), figures=figures,
-        trials=[_trial(i, s, t, g, found)
-                for i, (s, t, g) in enumerate(zip(signals, trials, segmentations, strict=True))],
-        sampler=body["sampler"], predictive=_checks(body.get("predictive")), notes=body.get("notes", ()),
+        trials=shown, sampler=body["sampler"], predictive=checks, notes=body.get("notes", ()),
     )  # fmt: skip
-
-
-def picture(draw: Callable[[Path], Any], caption: str) -> dict[str, str]:
-    """A figure as base64 PNG with its caption."""
-    with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
-        path = Path(folder) / "figure.png"
-        draw(path)
-        return {"data": embedded(path), "caption": caption}
-
-
-def _trial(i: int, signals: Signals, trial: Trial, segmentation: Segmentation,
-           found: Identification | None) -> dict[str, Any]:  # fmt: skip
-    pictures = [
-        picture(lambda p: draw_signals(signals, segmentation, p), "Signals with subtasks and boundaries")
-    ]
-    if found is not None:
-        identified = found
-        pictures.append(
-            picture(lambda p: draw_check(identified, i, p), "Recorded samples in their predicted bands")
-        )
-    evidence = segmentation.log_evidence
-    return {
-        "name": trial.name, "rate": f"{segmentation.rate:.4g}", "complete": segmentation.complete,
-        "log_evidence": "none" if evidence is None else f"{evidence:.1f}", "figures": pictures,
-        "spans": [
-            (s.label, s.state, f"{s.start:.3f}",
-             f"{s.start_90[0]:.3f} to {s.start_90[1]:.3f}" if s.start_sd else "", f"{s.end:.3f}")
-            for s in segmentation.spans
-        ],
-    }  # fmt: skip
-
-
-def _checks(predictive: dict[str, Any] | None) -> list[tuple[str, str, str]]:
-    """Posterior-predictive checks as rows."""
-    return [
-        (name, plain(check["p_value"], 2),
-         estimate(check["scatter_between_grips"], 0, shown_as("N" if name == "force" else "m")))
-        for name, check in (predictive or {}).items()
-    ]  # fmt: skip
 
 
 def _verdict(obj: str, entry: dict[str, Any]) -> str:
     parts = []
-    for prop, verb in (("weight", "weighs"), ("width", "is"), ("height", "is")):
+    for prop, text in (("weight", "weighs {}"), ("width", "is {} wide"), ("height", "is {} high")):
         if entry.get(prop):
-            value = estimate(entry[prop]["mean"], entry[prop]["sd"], SHOWN[prop])
-            parts.append(f"{verb} {value}" + {"weight": "", "width": " wide", "height": " high"}[prop])
+            parts.append(text.format(estimate(entry[prop]["mean"], entry[prop]["sd"], SHOWN[prop])))
     friction = entry.get("friction")
     if friction and friction.get("mean") is not None:
         parts.append(f"has a friction coefficient of {estimate(friction['mean'], friction['sd'])}")
@@ -132,28 +115,23 @@ def _verdict(obj: str, entry: dict[str, Any]) -> str:
 def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]]:
     """Block, property, estimate, intervals, what was measured and the deviation from it, source."""
     rows = []
-    for obj, entries in body["properties"].items():
-        for prop, entry in entries.items():
-            value = (measured or {}).get(obj, {}).get(prop)
-            source, shown = body["reasons"].get(f"{obj}.{prop}", ""), SHOWN[prop]
-            text, inner, outer, deviation = "unknown", "", "", ""
-            if entry is not None:
-                source = ", ".join(entry.get("subtasks", ()))
-                text = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
-                if entry.get("mean") is not None:
-                    text = estimate(entry["mean"], entry["sd"], shown)
-                    inner = interval(entry["interval_68"][0], entry["interval_68"][1], shown, sds=2.0)
-                    outer = interval(entry["interval_95"][0], entry["interval_95"][1], shown, sds=3.9)
-                    if value is not None:
-                        deviation = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"
-                        if body.get("actual", {}).get(obj, {}).get(prop, {}).get("disagrees"):
-                            deviation += ", disagrees"
-            apart = (
-                (estimate(value[0], value[1], shown) if value is not None else "", deviation)
-                if measured
-                else ()
-            )
-            rows.append((obj, prop, text, inner, outer, *apart, source))
+    for name, entry in ((f"{o}.{p}", e) for o, own in body["properties"].items() for p, e in own.items()):
+        obj, _, prop = name.rpartition(".")
+        value, shown = (measured or {}).get(obj, {}).get(prop), SHOWN[prop]
+        source, text, inner, outer, deviation = body["reasons"].get(name, ""), "unknown", "", "", ""
+        if entry is not None:
+            source = ", ".join(entry.get("subtasks", ()))
+            text = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
+        if entry is not None and entry.get("mean") is not None:
+            text = estimate(entry["mean"], entry["sd"], shown)
+            inner = interval(*entry["interval_68"], shown, sds=2.0)
+            outer = interval(*entry["interval_95"], shown, sds=3.9)
+            if value is not None:
+                compared = body.get("actual", {}).get(obj, {}).get(prop, {})
+                deviation = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"
+                deviation += ", disagrees" if compared.get("disagrees") else ""
+        apart = ("" if value is None else estimate(*value, shown), deviation) if measured else ()
+        rows.append((obj, prop, text, inner, outer, *apart, source))
     return rows
 
 
@@ -182,16 +160,16 @@ class Setting:
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
     """The page as text; `draw(path)` draws figures at path(name.png), which are embedded."""
-    with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
-        draw(lambda name: Path(folder) / name)
-        images = {p.stem: embedded(p) for p in sorted(Path(folder).iterdir())}
+    images = embedded(draw)
     effect = body["effects"].get("+".join(body["causes"]))
-    cells = finding.by_place(body)
+    fitted = (body.get("calibrated") or {}).get("parameters") or {}
+    cells, measured = finding.by_place(body), setting.measured
+    to_do = [*finding.to_do(body), *filter(None, [finding.settles(body, measured is not None)])]
     return rendered(
         "diagnose.html.j2",
         headline=finding.headline(body, setting.rig),
         lines=finding.sentences(body),
-        to_do=_to_do(body, setting) if body["verdict"] != "none" else [],
+        to_do=to_do if body["verdict"] != "none" else [],
         remains=finding.remains(body),
         parameters=_parameters(effect, body["causes"], setting) if effect and body["causes"] else [],
         subtasks=setting.subtasks,
@@ -204,19 +182,15 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         robot=finding.of_robot(body),
         compared="changes" in body,
         motion=setting.motion,
-        calibrated=_calibrated(body, setting),
+        calibrated=[(plain_name(n), *_values(n, p, shown_as(p["unit"]), setting)) for n, p in fitted.items()],
         numerics=_numerics(body),
-        properties=_properties(effect, setting.measured) if effect and body["causes"] else [],
-        measured=setting.measured is not None,
+        properties=_properties(effect, measured) if effect and body["causes"] else [],
+        measured=measured is not None,
         detection=_detection(body),
         far=_far(body),
         warnings=setting.warnings,
         files=setting.files,
     )
-
-
-def _to_do(body: Body, setting: Setting) -> list[str]:
-    return [*finding.to_do(body), *filter(None, [finding.settles(body, setting.measured is not None)])]
 
 
 def _heat(cells: Mapping[tuple[str, str], Sequence], subtasks: Sequence[str]) -> list[dict[str, Any]]:
@@ -225,11 +199,9 @@ def _heat(cells: Mapping[tuple[str, str], Sequence], subtasks: Sequence[str]) ->
     top = max(finding.share_of(found) for found in cells.values())
     out = []
     for channel in channels:
-        row: list[dict[str, str] | None] = []
-        for subtask in subtasks:
-            found = cells.get((channel, subtask))
-            row.append(_coloured(finding.share_of(found), top) if found else None)
-        out.append({"name": channel, "cells": row})
+        row = [cells.get((channel, subtask)) for subtask in subtasks]
+        shown = [_coloured(finding.share_of(found), top) if found else None for found in row]
+        out.append({"name": channel, "cells": shown})
     return out
 
 
@@ -262,12 +234,6 @@ def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setti
             words += f" {where}"
         rows.append((words, *_values(cause, p, shown, setting)))
     return rows
-
-
-def _calibrated(body: Body, setting: Setting) -> list[tuple[str, ...]]:
-    """What was fitted along before any cause was sought: parameter, the model's value, found, interval."""
-    known = (body.get("calibrated") or {}).get("parameters") or {}
-    return [(plain_name(n), *_values(n, p, shown_as(p["unit"]), setting)) for n, p in known.items()]
 
 
 def _values(

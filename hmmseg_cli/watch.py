@@ -8,9 +8,8 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
 from rich.columns import Columns
 from rich.console import Console, Group
 from rich.live import Live as RichLive
@@ -19,7 +18,8 @@ from rich.text import Text
 
 import hmmseg
 from hmmseg.errors import InputError
-from hmmseg_cli.console import JsonOption, Output, QuietOption, RigOption, TaskOption, UnusedSeed
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output
 from hmmseg_cli.inspect import sparkline
 
 if TYPE_CHECKING:
@@ -27,12 +27,6 @@ if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
     from hmmseg_cli.rows import Rows
 
-LagOption = Annotated[float, typer.Option(
-    "--lag", metavar="S", min=0.0, help="How long to wait before a boundary is settled [s].")]  # fmt: skip
-PlotOption = Annotated[bool, typer.Option(
-    "--plot", help="Show it live in the terminal (standard error).")]  # fmt: skip
-SkipOption = Annotated[bool, typer.Option(
-    "--skip-bad-rows", help="Leave out rows that cannot be read, instead of stopping.")]  # fmt: skip
 SAID = {
     "gaps": "gaps between rows", "late": "late rows put in their place",
     "repeated": "repeated rows counted once",
@@ -42,9 +36,9 @@ SAID = {
 
 
 def watch(
-    task: TaskOption, rig: RigOption, lag: LagOption = 1.0, plot: PlotOption = False,
-    skip_bad_rows: SkipOption = False, json: JsonOption = None, seed: UnusedSeed = 0,
-    quiet: QuietOption = False,
+    task: opt.Task, rig: opt.Rig, lag: opt.Lag = 1.0, plot: opt.Plot = False,
+    skip_bad_rows: opt.SkipBadRows = False, json: opt.Json = None, seed: opt.UnusedSeed = 0,
+    quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Follow a task while it runs: a CSV header then rows on standard input, one JSON line out per row."""
     from hmmseg.online.watcher import Watcher

@@ -21,12 +21,12 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from simgap.effects import catalogue, effect_named
 from simgap.effects.base import KINEMATICS, Performance
-from simgap.gap.twins import carried, recorded, scene_of
+from simgap.gap.twins import altered, carried, recorded, scene_of
 from simgap.gap.twins import performed as perform
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.replay import Replay, replay
-from simgap.world.simulate import SimulatedTrial
+from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 
 def table(document: tomlkit.TOMLDocument, name: str) -> Table:
@@ -149,7 +149,9 @@ def checked(effects: Mapping[str, Mapping[str, float]], where: str) -> None:
 def performed(
     task: BlockTask, rig: Rig, blocks: Sequence[Blocks], seeds: Sequence[int], operator: OperatorSettings
 ) -> list[SimulatedTrial]:
-    """Trials by the model's own operator in the corrected scene, recorded by the corrected sensors."""
+    """Trials by the model's own operator in the rig's scene, recorded by its sensors, with its [effects]."""
+    if not rig.effects:
+        return simulate_trials(task, rig, blocks, seeds, operator)
     done = perform(task, rig, blocks, seeds, rig.effects, operator)
     return [replace(s, trial=recorded(s, task, rig, rig.effects)) for s in done]
 
@@ -162,6 +164,8 @@ def replayed(
     Effects that can be are taken off the recorded angles before these drive the model. One that changes
     angles and cannot (play, jitter) cannot be taken back and is left out of the motion.
     """
+    if not rig.effects:
+        return replay(trial, task, rig, blocks, boundaries=boundaries)
     hand, around, blocks = scene_of(rig, blocks, rig.effects)
     channels = dict(trial.channels)
     for name, values in rig.effects.items():
@@ -174,11 +178,9 @@ def replayed(
         found.t, found.motion.position, found.motion.velocity, force.reshape(n, 2, 2),
         np.asarray(boundaries, float), rig, *carried(found.t, boundaries, task, blocks),
     )  # fmt: skip
-    rng = np.random.default_rng(0)
-    acting = sorted((effect_named(name) for name in rig.effects), key=lambda e: -e.stage)
-    for effect in acting:
-        if effect.apply is not None and effect.stage != KINEMATICS:
-            truth = effect.apply(truth, dict(rig.effects[effect.name]), rng)
+    acting = sorted(map(effect_named, rig.effects), key=lambda e: -e.stage)
+    felt = {e.name: rig.effects[e.name] for e in acting if e.stage != KINEMATICS}
+    truth = altered(truth, felt, np.random.default_rng(0))
     force = np.stack([np.interp(found.signals.t, found.t, c) for c in truth.force.reshape(n, 4).T], 1)
     for effect in acting:
         if effect.finish is not None:

@@ -281,7 +281,8 @@ class Decomposition(Tabled):
             evidence = next((e for e in entry.evidence if index in e.subtasks), None)
             if evidence is not None:
                 found.append((entry, evidence))
-        return sorted(found, key=lambda pair: _rank(pair[0].name))
+        order = (WEIGHT, WIDTH, HEIGHT, FRICTION)  # friction on a support comes last
+        return sorted(found, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
 
     def in_paper(self, index: int, entry: Property) -> bool:
         """Whether the paper's Table 1 would list the property for this subtask.
@@ -315,11 +316,6 @@ class Decomposition(Tabled):
         from hmmseg.contact.tables import decomposition_table
 
         return [decomposition_table(self)]
-
-
-def _rank(name: str) -> int:
-    order = (WEIGHT, WIDTH, HEIGHT, FRICTION)
-    return order.index(name) if name in order else len(order)
 
 
 VARYING_LOAD = "the vertical force must vary while the object slides"
@@ -372,17 +368,14 @@ def decompose(task: AnyTask) -> Decomposition:
         rubbed = [key for key, owner in learned if owner == name and key.startswith(FRICTION_ON)]
         properties[name] = {}
         for key in (*PROPERTIES, FRICTION, *sorted(set(rubbed))):
-            evidence = tuple(sorted(learned.get((key, name), ()), key=_strength))
+            ways = learned.get((key, name), ())
+            evidence = tuple(sorted(ways, key=lambda e: (e.bound, e.condition is not None, e.subtasks)))
             reason = None if evidence else _reason(task, states, name, key)
             properties[name][key] = Property(name, key, evidence, reason)
     notes = ()
     if task.repeat == "unknown":
         notes = ("the moves repeat as often as the recording shows; one round is decomposed",)
     return Decomposition(task, subtasks(task), properties, notes)
-
-
-def _strength(evidence: Evidence) -> tuple[bool, bool, tuple[int, ...]]:
-    return evidence.bound, evidence.condition is not None, evidence.subtasks
 
 
 def _learn(states: list[ContactState]) -> dict[Unknown, list[Evidence]]:

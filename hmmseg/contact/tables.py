@@ -17,7 +17,6 @@ from hmmseg.contact.decompose import (
     Decomposition,
     Evidence,
     Property,
-    Unknown,
     height_equations,
 )
 from hmmseg.io.task import BlockTask
@@ -26,7 +25,8 @@ from hmmseg.io.task import BlockTask
 def cell(found: Decomposition, index: int, entry: Property, evidence: Evidence) -> str:
     """Signals that subtask `index` gives towards a property; in parentheses what goes beyond the paper."""
     partners = [str(other + 1) for other in evidence.subtasks if other != index]
-    text = (">= " if evidence.bound else "") + _signals(evidence.signals(index))
+    signals = " and ".join(evidence.signals(index)).replace("horizontal forces and", "horizontal and")
+    text = (">= " if evidence.bound else "") + signals
     if entry.object != found.subtasks[index].object:
         text = f"{entry.object}: {text}"
     if partners:
@@ -34,11 +34,6 @@ def cell(found: Decomposition, index: int, entry: Property, evidence: Evidence) 
     if evidence.condition:
         text += f"; {evidence.condition}"
     return text if found.in_paper(index, entry) else f"({text})"
-
-
-def _signals(names: tuple[str, ...]) -> str:
-    both = names == ("horizontal forces", "vertical forces")
-    return "horizontal and vertical forces" if both else " and ".join(names)
 
 
 def equation(found: Decomposition) -> str:
@@ -147,10 +142,5 @@ def _property(entry: Property) -> dict[str, Any] | None:
 
 def _terms(evidence: Evidence) -> dict[str, Any]:
     return {"kind": "bound" if evidence.bound else "value",
-            "given": [_key(unknown) for unknown in evidence.given],
+            "given": [f"{owner}.{name}" for name, owner in evidence.given],
             "condition": evidence.condition}  # fmt: skip
-
-
-def _key(unknown: Unknown) -> str:
-    name, owner = unknown
-    return f"{owner}.{name}"

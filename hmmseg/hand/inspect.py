@@ -86,22 +86,27 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     already = {} if rig is None else (rig.topics if table.messages else rig.columns)
     entries = {} if already else propose(table)
     entries, said = mended(table, entries, rig)
-    said = [*table.notes, *(f"{path}: {line}" for line in (*_lengths(table), *said))]
+    by_length: dict[int, list[str]] = {}
+    for name, values in table.columns.items():
+        by_length.setdefault(len(values), []).append(name)
+    others = f"not {table.rows.size} as the others: they are not read together"
+    odd = [f"columns {', '.join(names)} have {length} rows, {others}"
+           for length, names in by_length.items() if length != table.rows.size]  # fmt: skip
+    said = [*table.notes, *(f"{path}: {line}" for line in (*odd, *said))]
     toml = as_toml(entries, table) if entries else ""
     if set(entries) <= {"t"} and not already and (rig is None or rig.gripper is None):
         toml = propose_gripper(table, entries) or toml
     t, origin = _clock(table, entries, rig)
     channels = tuple(_channel(table, name, t) for name in table.names if name in table.columns)
     gaps: list[tuple[float, float]] = []
-    rate = None
+    rate, ends = None, (None, None) if t is None or not t.size else (float(t[0]), float(t[-1]))
     if t is not None and t.size > 2:
         steps = np.diff(t)
         rate = float(1 / np.median(steps)) if np.median(steps) > 0 else None
         wide = np.flatnonzero(steps > GAP * np.median(steps))
         gaps = [(float(t[i]), float(t[i + 1])) for i in wide]
     return Inspection(
-        str(path), tuple(parts), int(table.rows.size), None if t is None or not t.size else float(t[0]),
-        None if t is None or not t.size else float(t[-1]), rate, origin, tuple(gaps), channels, entries,
+        str(path), tuple(parts), int(table.rows.size), *ends, rate, origin, tuple(gaps), channels, entries,
         toml, tuple(said), not toml and _understood(table, rig),
     )  # fmt: skip
 
@@ -114,16 +119,6 @@ def _understood(table: Table, rig: Rig | None) -> bool:
         return bool(trial_of(table, rig, None).channels)
     except InputError:
         return False
-
-
-def _lengths(table: Table) -> list[str]:
-    """What is said of columns of another length than most."""
-    by_length: dict[int, list[str]] = {}
-    for name, values in table.columns.items():
-        by_length.setdefault(len(values), []).append(name)
-    others = f"not {table.rows.size} as the others: they are not read together"
-    return [f"columns {', '.join(names)} have {length} rows, {others}"
-            for length, names in by_length.items() if length != table.rows.size]  # fmt: skip
 
 
 def _clock(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None
@@ -150,16 +145,9 @@ def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
     if rate is None and t is not None and t.size > 2 and t[-1] > t[0]:
         rate = float((there.size - 1) / (t[-1] - t[0]))
     low, high = (float(there.min()), float(there.max())) if there.size else (None, None)
-    return Channel(
-        name, unit, rate, values.size, values.size - there.size, between, low, high, _course(values)
-    )
-
-
-def _course(values: np.ndarray) -> tuple[float, ...]:
-    """Means of equal stretches, NaN where nothing is."""
-    with np.errstate(invalid="ignore"):
-        pieces = np.array_split(values, min(BUCKETS, max(values.size, 1)))
-        return tuple(float(np.mean(p[np.isfinite(p)])) if np.isfinite(p).any() else np.nan for p in pieces)
+    pieces = [p[np.isfinite(p)] for p in np.array_split(values, min(BUCKETS, max(values.size, 1)))]
+    course = tuple(float(p.mean()) if p.size else np.nan for p in pieces)
+    return Channel(name, unit, rate, values.size, values.size - there.size, between, low, high, course)
 
 
 TIME = ("t", "time", "timestamp", "stamp", "timestamps", "sec", "seconds", "clock", "times", "zeit",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import Column
-from hmmseg.robust import white_sd
+from hmmseg.robust import runs, white_sd
 
 SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
 FASTEST = 2e4  # limit: [Hz]; of what a hand's or a robot's sensors are read at
@@ -303,38 +303,31 @@ class Holds:
 
 def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     """Swapped fingers, flipped signs, and weight that is not the block's."""
-    signals = task_space(trial, rig)
-    squeeze, common = (signals.fx1 - signals.fx2) / 2, (signals.fx1 + signals.fx2) / 2
-    there = (
-        np.isfinite(squeeze)
-        & np.isfinite(signals.distance)
-        & np.isfinite(signals.y)
-        & np.isfinite(signals.fy)
-    )
+    s = task_space(trial, rig)
+    there = np.isfinite([s.fx1 - s.fx2, s.distance, s.y, s.fy]).all(axis=0)
     if there.sum() < 4 * BRIEF:
         return []
-    load = signals.fy[there]
-    same = _pushing_alike(common[there], squeeze[there], load)
+    s = replace(s, **{name: v[there] for name, v in vars(s).items() if isinstance(v, np.ndarray)})
+    squeeze, load = (s.fx1 - s.fx2) / 2, s.fy
+    same = _pushing_alike((s.fx1 + s.fx2) / 2, squeeze, load)
     if same is not None:
-        finger = 2 if same > 0 else 1
+        name = "fx2" if same > 0 else "fx1"
         problem = "fx1 and fx2 push the same way all along, a grip pushes from both sides"
-        return [Finding(f"fx{finger}", problem, changed(f"fx{finger}", rig, sign=-1))]
-    holds = find_holds(squeeze[there], signals.y[there])
+        return [Finding(name, problem, changed(name, rig, sign=-1))]
+    holds = find_holds(squeeze, s.y)
     if holds is None:
         return []
-    apart = _agreed(signals.distance[there][holds.pressed])
-    towards = _agreed(squeeze[there][holds.pressed])
+    apart, towards = _agreed(s.distance[holds.pressed]), _agreed(squeeze[holds.pressed])
     lifts = holds.pressed & (holds.height > LIFTED)
     idle = float(np.median(load[holds.before])) if holds.before.sum() >= BRIEF else 0.0
     carried = _agreed(load[lifts] - idle, MOST) if lifts.sum() >= BRIEF else 0
-    bearing = signals.fy1[there][lifts], signals.fy2[there][lifts]
-    first, second = (float(np.median(f)) if f.size >= BRIEF else 0.0 for f in bearing)
+    first, second = (float(np.median(f[lifts])) if lifts.sum() >= BRIEF else 0.0 for f in (s.fy1, s.fy2))
     found = _sides(apart, towards, carried, first * second > 0, trial, rig)
     found = found or _one_bears(first, second, idle, rig)
     found = found or _downwards(holds, load, trial, rig)
     if found or lifts.sum() < BRIEF:
         return found
-    grip = float(np.median(np.abs(squeeze[there][holds.pressed])))
+    grip = float(np.median(np.abs(squeeze[holds.pressed])))
     return _own_weight(idle, float(np.median(load[lifts])) - idle, grip, rig)
 
 
@@ -348,18 +341,15 @@ def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial
         stems = JOINT_STEMS if rig.jointed else CARTESIAN_STEMS
         return [Finding("x1", problem, exchanged(stems, ("1", "2"), trial, rig))]
     if apart > 0 and towards < 0:
+        names, problem = ("fx1", "fx2"), "is negative and fx2 positive in a grip: their signs are flipped"
         if carried < 0:
+            names = FORCE_CHANNELS
             problem = "is negative in a grip and fy1 + fy2 in a lift: forces on the finger, not by it"
-            changes = all_changed(FORCE_CHANNELS, rig, sign=-1)
-        else:
-            problem = "is negative and fx2 positive in a grip: their signs are flipped"
-            changes = all_changed(("fx1", "fx2"), rig, sign=-1)
-        return [Finding("fx1", problem, changes)]
+        return [Finding("fx1", problem, all_changed(names, rig, sign=-1))]
     if apart < 0 and towards > 0 and not rig.jointed:
         problem = "is right of x2 in a grip, but fx1 pushes to the right: positions swapped or x flipped"
         moved = [name for name in ("x1", "vx1", "x2", "vx2") if name in trial.channels]
-        changes = all_changed(moved, rig, sign=-1)
-        return [Finding("x1", problem, changes)]
+        return [Finding("x1", problem, all_changed(moved, rig, sign=-1))]
     if apart > 0 and towards > 0 and carried < 0 and both_bear:
         problem = "and fy2 are negative in sum while a block is lifted: their signs are flipped"
         return [Finding("fy1", problem, all_changed(("fy1", "fy2"), rig, sign=-1))]
@@ -382,9 +372,7 @@ def _downwards(holds: Holds, load: np.ndarray, trial: Trial, rig: Rig) -> list[F
     low = holds.pressed & (holds.height < -LIFTED)
     axes = ["y1", "y2"] if float(np.median(load[low])) > 0 else ["y1", "y2", "fy1", "fy2"]
     axes += [name for name in ("vy1", "vy2") if name in trial.channels]
-    problem = (
-        "every hold first goes down from where it began, through what the block stands on: y points down"
-    )
+    problem = "every hold first goes down from where it began, through its block's support: y points down"
     return [Finding("y1", problem, all_changed(axes, rig, sign=-1), certain=False)]
 
 
@@ -395,11 +383,9 @@ def _own_weight(idle: float, lifted: float, grip: float, rig: Rig) -> list[Findi
     """
     if abs(idle) < max(abs(lifted), 0.1 * grip):
         return []
-    problem = (
-        f"and fy2 sum to {idle:.3g} N before the first touch, a lift adds {lifted:.3g} N: gravity or "
-        "an offset is still in the forces"
-    )
+    problem = f"and fy2 sum to {idle:.3g} N before the first touch, a lift adds {lifted:.3g} N"
     changes = all_changed(("fy1", "fy2"), rig, offset=round(-idle / 2, 4))
+    problem += ": gravity or an offset is still in the forces"
     return [Finding("fy1", problem, changes, certain=False)]
 
 
@@ -409,11 +395,9 @@ def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
     noise = white_sd(squeeze, 1)
     if scale == 0 or scale < 10 * noise:
         return None
-    pressed = np.abs(squeeze) > scale / 2
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], pressed.astype(int), [0]])))
     height, rises = np.zeros(y.size), []
     kept = np.zeros(y.size, dtype=bool)
-    for start, end in edges.reshape(-1, 2):
+    for start, end in runs(np.abs(squeeze) > scale / 2):
         if end - start >= BRIEF:
             kept[start:end] = True
             height[start:end] = y[start:end] - y[start]

@@ -89,7 +89,9 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
     out: list[Finding] = []
     looks = [check_clock, check_lengths, check_angles, check_velocities, check_forces]
     if not halved(trial):  # a wrist's force has no sides
-        looks += [check_noise, check_axes, check_signs] if _felt(trial) else [check_noise]
+        forces = [trial.channels[name] for name in FORCE_CHANNELS if name in trial.channels]
+        felt = all(np.mean(np.isnan(force)) < SPARSE for force in forces)  # often enough to judge sides by
+        looks += [check_noise, check_axes, check_signs] if felt else [check_noise]
     if rig.gripper is not None:
         looks = [check_clock, check_gripper]
     for look in looks:
@@ -99,12 +101,6 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
             if finding.certain:
                 return out
     return out
-
-
-def _felt(trial: Trial) -> bool:
-    """Whether forces are there often enough to judge sides and signs by."""
-    forces = [trial.channels[name] for name in FORCE_CHANNELS if name in trial.channels]
-    return all(np.mean(np.isnan(force)) < SPARSE for force in forces)
 
 
 def check(trial: Trial, rig: Rig) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS
 from hmmseg.levels import SURE
-from hmmseg.robust import robust_sd, white_sd
+from hmmseg.robust import robust_sd, runs, white_sd
 
 NEAR = 0.3  # limit: relative; noise is stated to within so much, and units differ by factors of 4 and more
 LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with what hangs below its sensor
@@ -171,8 +171,7 @@ def _kinds(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
     noise = rig.noise
     if rig.gripper is not None:
         g = rig.gripper
-        kinds = [(g.wrench[:3], None), (g.wrench[3:], None), (tuple(g.position.values()), None),
-                 (tuple(g.opening), None)]  # fmt: skip
+        kinds = [(names, None) for names in (g.wrench[:3], g.wrench[3:], g.position.values(), g.opening)]
     else:
         places = JOINTS if rig.jointed else CARTESIAN
         rates = tuple(("d" if rig.jointed else "v") + name for name in places)
@@ -212,13 +211,13 @@ def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: li
     if there.size < MIN_ALIVE:
         return None, np.zeros(values.size, bool)
     shown = values[there]
-    same = np.diff(shown) == 0
-    runs = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]]))).reshape(-1, 2)
     stuck = np.zeros(values.size, bool)
     standing: dict[float, list[tuple[float, float]]] = {}
-    for start, stop in runs[np.argsort(runs[:, 0] - runs[:, 1])][:MOST]:
+    other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
+    for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
         value, at = float(shown[start]), there[start : stop + 1]
-        if stop - start < 2 or (value == 0 and _both_zero(name, at, seen)):
+        # Where the other finger's force is exactly zero as well, sensors hide what is small.
+        if stop - start < 2 or (value == 0 and other is not None and np.mean(other[at] == 0) > 0.5):
             continue
         chance = _chance_of_repeat(name, value, at, seen, fellows, stated)
         unlikely = np.log(shown.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
@@ -236,12 +235,6 @@ def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: li
     else:
         problem = f"repeats {value:.4g} to the last digit"
     return Fault(name, f"{problem}, and is left out", every), stuck
-
-
-def _both_zero(name: str, at: np.ndarray, seen: dict[str, np.ndarray]) -> bool:
-    """Whether the other finger's force is exactly zero as well: sensors that hide what is small."""
-    other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
-    return other is not None and bool(np.mean(other[at] == 0) > 0.5)
 
 
 def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
@@ -339,10 +332,8 @@ def _missing(trial: Trial) -> list[Fault]:
     gone = {name: ~np.isfinite(values) for name, values in trial.channels.items()}
     out = []
     for name, lost in gone.items():
-        share = float(lost.mean())
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]]))).reshape(-1, 2)
-        long = []
-        for start, stop in edges:
+        share, long = float(lost.mean()), []
+        for start, stop in runs(lost):
             chance = (lost.sum() - (stop - start) + 1) / (lost.size - (stop - start) + 2)
             unlikely = np.log(lost.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
             if unlikely and trial.t[stop - 1] - trial.t[start] > PAUSE:
@@ -355,9 +346,8 @@ def _missing(trial: Trial) -> list[Fault]:
         return [replace(out[0], channel="every channel")]
     whole = float((~np.any(list(gone.values()), axis=0)).mean())
     if not out and whole < WHOLE:
-        return [
-            Fault("every row" if whole == 0 else f"all but {whole:.0%} of the rows", "without some reading")
-        ]
+        rows = "every row" if whole == 0 else f"all but {whole:.0%} of the rows"
+        return [Fault(rows, "without some reading")]
     return out
 
 

@@ -131,25 +131,11 @@ def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WI
     period = float(even[1] - even[0])
     length = max(LEAST, round(window / period) // 2 * 2 + 1)
     length = min(length, (len(t) - 1) // 2 * 2 + 1)
-    gridded = np.stack([np.interp(even, t, column) for column in flat.T], axis=1)
-    found = np.stack([_parabolas(column, length, deriv) for column in gridded.T], axis=1) / period**deriv
-    out = np.stack([np.interp(t, even, column) for column in found.T], axis=1)
-    return out.reshape(values.shape)
+    from scipy.signal import savgol_filter  # slow to import
 
-
-def _parabolas(values: np.ndarray, length: int, deriv: int) -> np.ndarray:
-    """Values (N,), or their derivative a step, of parabolas through `length` (odd) of them about each.
-
-    The first and the last half of `length` are on the first and the last parabola. As
-    scipy.signal.savgol_filter, whose import takes longer than most recordings.
-    """
-    half = length // 2
-    steps = np.vander(np.arange(-half, half + 1), 3, increasing=True)
-    fit = np.linalg.pinv(steps)
-    slopes = [steps, np.pad(steps[:, :2], ((0, 0), (1, 0))) * (0, 1, 2), np.eye(3)[[2] * length] * 2]
-    middle = np.convolve(values, (slopes[deriv][half] @ fit)[::-1], mode="valid")
-    first, last = (slopes[deriv] @ (fit @ end) for end in (values[:length], values[-length:]))
-    return np.concatenate([first[:half], middle, last[half + 1 :]])
+    gridded = np.stack([np.interp(even, t, column) for column in flat.T])
+    found = savgol_filter(gridded, length, 2, deriv, period)
+    return np.stack([np.interp(t, even, column) for column in found], axis=1).reshape(values.shape)
 
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner
@@ -253,7 +239,11 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     error = scale * np.sqrt(together) * fitted.errors
     if not between and np.all(np.abs(fitted.drift) < SURE * error[2:]):
         axes, fitted, scale = _fit(rig, force, terms, 0 * time, turns)
-    _check(where, gripper, fitted.inertia, float(error[0]))
+    left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
+    if (left_open or gripper.reaction is None) and abs(fitted.inertia) < SURE * float(error[0]):
+        problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
+        raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
+                         "under [gripper], as they are mounted")  # fmt: skip
     mass = fitted.mass if fitted.mass is not None else fitted.inertia
     offset, drift = axes @ fitted.offset, axes @ fitted.drift
     against = gripper.reaction is not None and fitted.inertia < -SURE * float(error[0])
@@ -335,15 +325,6 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
     if gripper.reaction is not None or size[2] < 1e-3 * size[0]:
         flip[2] = (-1.0 if gripper.reaction else 1.0) * np.linalg.det(left @ right)
     return (left * flip) @ right
-
-
-def _check(where: str, gripper: Gripper, inertia: float, error: float) -> None:
-    """InputError where free motion does not determine what the rig leaves open."""
-    left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
-    if (left_open or gripper.reaction is None) and abs(inertia) < SURE * error:
-        problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
-        raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
-                         "under [gripper], as they are mounted")  # fmt: skip
 
 
 def _centre_of_mass(trial: Trial, gripper: Gripper, tool: Tool, free: np.ndarray,

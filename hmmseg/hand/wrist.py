@@ -28,7 +28,7 @@ from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warning
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import MOVED, SURE
-from hmmseg.robust import bridged, robust_sd, white_sd
+from hmmseg.robust import bridged, robust_sd, runs, white_sd
 
 STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
 SLOWED = 0.9  # chosen: share of its speed that a closing keeps until the first touch
@@ -103,11 +103,8 @@ def grip_of(t: np.ndarray, opening: np.ndarray, active: np.ndarray, closing: tup
     if give is not None:
         width, sd = held + give, 0.0
     else:
-        estimates = [
-            _touch(t, opening, begun, first, held),
-            *_release(t, opening, active, last, opened, held),
-        ]
-        width, sd = _together(estimates, held, ceiling)
+        released = _release(t, opening, active, last, opened, held)
+        width, sd = _together([_touch(t, opening, begun, first, held), *released], held, ceiling)
     start = int(inside[np.argmax(opening[inside] <= width)])
     after = np.flatnonzero(opening[last : opened + 1] > width)
     stop = int(last + after[0]) if after.size else opened + 1
@@ -159,20 +156,16 @@ def _release(t: np.ndarray, opening: np.ndarray, active: np.ndarray, last: int, 
     lead = max(3, int(3 * STEP / np.median(np.diff(t))))
     way = _coarse(t, opening, max(last - lead, 0), opened + 1)
     top = float(opening[opened]) if opened > last else held
-    kink = _kink(way[: int(np.argmax(way > (held + top) / 2)) + 2] if (way > (held + top) / 2).any() else way,
-                 _noise(opening))  # fmt: skip
+    wide = np.flatnonzero(way > (held + top) / 2)
+    kink = _kink(way[: wide[0] + 2] if wide.size else way, _noise(opening))
     if kink is not None and kink[0] > held:
         found.append(kink)
     felt = np.flatnonzero(active[last : opened + 1])
     if felt.size and last + felt[-1] < opened and active[last : last + felt[-1] + 1].all():
         i = int(last + felt[-1])
-        if opening[i] > held:
-            found.append(
-                (
-                    float(opening[i] + opening[i + 1]) / 2,
-                    abs(float(opening[i + 1] - opening[i])) / np.sqrt(12),
-                )
-            )
+        before, after = float(opening[i]), float(opening[i + 1])
+        if before > held:
+            found.append(((before + after) / 2, abs(after - before) / np.sqrt(12)))
     return found
 
 
@@ -224,16 +217,15 @@ def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
 
 def _cancelling(trial: Trial, rig: Rig) -> list[Finding]:
     """Two fingers' ways of which one counts the other way: their sum stays while they move."""
-    gripper = rig.wrist
-    if len(gripper.opening) < 2:
+    names = rig.wrist.opening
+    if len(names) < 2:
         return []
-    first, second = (trial.channels[name] for name in gripper.opening)
-    swings = [_travel(trial, name) for name in gripper.opening]
-    total = first + second
-    if not np.isfinite(total).any() or np.nanmax(total) - np.nanmin(total) > CANCELLED * min(swings):
+    first, second = (trial.channels[name] for name in names)
+    total, least = first + second, min(_travel(trial, name) for name in names)
+    if not np.isfinite(total).any() or np.nanmax(total) - np.nanmin(total) > CANCELLED * least:
         return []
-    name = gripper.opening[int(np.nanmedian(second) < np.nanmedian(first))]
-    problem = f"moves while {' + '.join(gripper.opening)} stays as it is: it counts the other way"
+    name = names[int(np.nanmedian(second) < np.nanmedian(first))]
+    problem = f"moves while {' + '.join(names)} stays as it is: it counts the other way"
     return [Finding(name, problem, changed(name, rig, sign=-1))]
 
 
@@ -335,15 +327,18 @@ class Held:
 def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None
             ) -> Held:  # fmt: skip
     """What closings of the opening (num_timesteps,) [m] hold; `pressing` as `grip_force_of` has it."""
-    held = closings(opening)
-    free = _surely_free(opening, held)
+    held, free = closings(opening), np.ones(opening.size, bool)
+    for begun, least, opened in held:  # surely free is what is more open than halfway back
+        top = min(opening[begun], opening[opened]) if opened > least else opening[begun]
+        inside = slice(begun, opened + 1)
+        free[inside] &= ~(opening[inside] < opening[least] + 0.5 * (top - opening[least]))
     tool = free_tool(trial, rig, pose, free)
     force = applied_force(trial, rig, pose, tool)
     active = np.linalg.norm(np.nan_to_num(force), axis=1) > SURE * tool.noise
     each = [grip_of(trial.t, opening, active, c, give_of(rig, pressing, opening, c)) for c in held]
     grips = [grip for grip in each if grip is not None]
     loads = [_load(grip, pose, force, tool) for grip in grips]
-    lifts = [load for grip, load in zip(grips, loads, strict=True) if load and _is_raised(grip, pose)]
+    lifts = [load for grip, load in zip(grips, loads, strict=True) if load and _raised(grip, pose).any()]
     return Held(grips, loads, tool, force, free, lifts)
 
 
@@ -362,7 +357,7 @@ def contradiction(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, held:
     others = [(replace(pose, up=-pose.up), points_down),
               (replace(pose, up=pose.across, across=pose.up), exchanged_axes)]  # fmt: skip
     borne = [[_load(grip, other, held.force, held.tool) for grip in held.grips
-              if _is_raised(grip, other)] for other, _ in others]  # fmt: skip
+              if _raised(grip, other).any()] for other, _ in others]  # fmt: skip
     least = [min(load for load in loads if load) if _lifts_all(loads) else 0.0 for loads in borne]
     best = int(np.argmax(least))
     return others[best][1](trial, rig) if least[best] > 0 else None
@@ -372,16 +367,6 @@ def _lifts_all(loads: list[float | None]) -> bool:
     """Whether every grip that goes anywhere bears something, and there is one."""
     there = [load for load in loads if load is not None]
     return bool(there) and min(there) > 0
-
-
-def _surely_free(opening: np.ndarray, held: list[tuple[int, int, int]]) -> np.ndarray:
-    """Samples outside of everything that may be a grip: more open than halfway back."""
-    free = np.ones(opening.size, bool)
-    for begun, least, opened in held:
-        top = min(opening[begun], opening[opened]) if opened > least else opening[begun]
-        inside = np.arange(begun, opened + 1)
-        free[inside[opening[inside] < opening[least] + 0.5 * (top - opening[least])]] = False
-    return free
 
 
 def grip_force_of(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
@@ -411,13 +396,13 @@ def give_of(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, 
 
 
 def _raised(grip: Grip, pose: Pose) -> np.ndarray:
-    """Samples of a grip (num_samples,) in which the hand is higher than where it begins and ends."""
+    """Samples of a grip (num_samples,) in which the hand is higher than where it begins and ends.
+
+    None where they are too few.
+    """
     height = pose.position[grip.start : grip.stop] @ pose.up
-    return height - max(height[0], height[-1]) > MOVED
-
-
-def _is_raised(grip: Grip, pose: Pose) -> bool:
-    return bool(_raised(grip, pose).sum() > LEAST)
+    raised = height - max(height[0], height[-1]) > MOVED
+    return raised & (raised.sum() > LEAST)
 
 
 def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
@@ -426,10 +411,10 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
     None where it never goes anywhere, which leaves nothing to judge by.
     """
     inside = slice(grip.start, grip.stop)
-    raised = _raised(grip, pose)
-    lifted = _is_raised(grip, pose)
-    far = np.linalg.norm(pose.position[inside] - pose.position[grip.start], axis=1) > MOVED
-    moved = raised if lifted else far
+    moved = _raised(grip, pose)
+    lifted = bool(moved.any())
+    if not lifted:
+        moved = np.linalg.norm(pose.position[inside] - pose.position[grip.start], axis=1) > MOVED
     load = force[inside][moved] @ (pose.up if lifted else pose.across)
     load = load[np.isfinite(load)]
     if load.size <= LEAST:
@@ -491,7 +476,16 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     held = held_by(trial, rig, pose, opening, pressing)
     signs: tuple[str, ...] = ()
     if held.lifts and max(held.lifts) < 0:
-        held, rig, signs = _with_other_sign(trial, rig, pose, opening, pressing, held)
+        # What is lifted hangs on the hand: that shows the sign before the hand's own inertia does.
+        least = min(held.lifts)
+        for reaction in (True, False) if gripper.reaction is None else ():
+            other = rig.model_copy(update={"gripper": gripper.model_copy(update={"reaction": reaction})})
+            found = held_by(trial, other, pose, opening, pressing)
+            if found.lifts and max(found.lifts) > 0:
+                held, rig, signs = found, other, (pose_remark(trial, other, max(found.lifts)),)
+                break
+        if not signs:
+            raise other_sign(trial, rig, least)
     elif held.lifts and held.tool.against:
         signs = (pose_remark(trial, rig, max(held.lifts)),)
     elif held.tool.against:
@@ -505,21 +499,6 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     order = order_warnings(trial, rig, held.tool, held.free)
     named = order or tool_warnings(trial, rig, held.tool)
     return replace(found, warnings=(*found.warnings, *signs, *named))
-
-
-def _with_other_sign(
-    trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None, held: Held
-) -> tuple[Held, Rig, tuple[str, ...]]:
-    """What is held with the other sign, where lifts pull up and none is stated; else InputError.
-
-    What is lifted hangs on the hand: that shows the sign before the hand's own inertia does.
-    """
-    for reaction in (True, False) if rig.wrist.reaction is None else ():
-        other = rig.model_copy(update={"gripper": rig.wrist.model_copy(update={"reaction": reaction})})
-        found = held_by(trial, other, pose, opening, pressing)
-        if found.lifts and max(found.lifts) > 0:
-            return found, other, (pose_remark(trial, other, max(found.lifts)),)
-    raise other_sign(trial, rig, min(held.lifts))
 
 
 def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,
@@ -561,10 +540,9 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     if rig.wrist.turns:  # by which fingers and block stand askew, who are level in these channels
         closing = pose.turned[:, :, AXES.index(rig.wrist.closing)]
         channels[ROLL] = np.arcsin(np.clip(closing @ pose.up, -1.0, 1.0))
-    if pressing is not None and not isinstance(pressing, float):
-        missing = ~np.isfinite(pressing)
+    if isinstance(pressing, np.ndarray):
         for name in ("fx1", "fx2"):
-            channels[name] = np.where(missing, np.nan, channels[name])
+            channels[name] = np.where(np.isfinite(pressing), channels[name], np.nan)
     sds = [each.width_sd for each in grips]
     touch_sd = float(np.sqrt(np.mean(np.square(sds)))) if sds else 0.0
     touches = tuple(touch for each in grips for touch in _touches(t, opening, each))
@@ -618,9 +596,7 @@ def _around(t: np.ndarray, pose: Pose) -> int:
 def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> list[str]:
     """Where the wrist feels something for a while though the opening says that nothing is held."""
     t, out = trial.t, []
-    active = free & (np.nan_to_num(felt) > max(2 * SURE * tool.noise, STRAY))
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], active.astype(int), [0]])))
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in runs(free & (np.nan_to_num(felt) > max(2 * SURE * tool.noise, STRAY))):
         if t[stop - 1] - t[start] > STRAY_TIME:
             most = float(np.nanmax(felt[start:stop]))
             when = f"from {t[start]:.2f} to {t[stop - 1]:.2f} s, with up to {most:.2g} N"

@@ -9,8 +9,6 @@ from hmmseg.hmm.inference import log_evidence as log_evidence
 from hmmseg.hmm.inference import sample as sample
 from hmmseg.hmm.inference import smooth as smooth
 from hmmseg.hmm.inference import viterbi as viterbi
-from hmmseg.hmm.learn import Durations as Durations
-from hmmseg.hmm.learn import Emission as Emission
 from hmmseg.hmm.learn import em as em
 from hmmseg.hmm.results import Alignment as Alignment
 from hmmseg.hmm.results import Alignments as Alignments

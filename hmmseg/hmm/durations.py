@@ -130,11 +130,6 @@ def _arrays(chain: DurationChain) -> DurationChain:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf).astype(jnp.float64), chain)
 
 
-def _entering(left: Array, jumps: Array) -> Array:
-    """Weights of entering each state, from those of having just left each."""
-    return reduce(log_add, [forwards(left + jump, d) for d, jump in enumerate(jumps, 1)])
-
-
 def _forward(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Array]:
     """Log evidence, `enter` (num_samples, num_states) and `leave` (num_samples + 1, num_states)."""
 
@@ -143,8 +138,9 @@ def _forward(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Ar
         window = forwards(window, 1).at[:, 0].set(row(enter, t - 1)) + known(row(x, t - 1))[:, None]
         left = log_sum(window + jnp.where(t == n, chain.survival, chain.pmf), 1)
         leave = lax.dynamic_update_index_in_dim(leave, left, t, 0)
+        entering = reduce(log_add, [forwards(left + j, d) for d, j in enumerate(jnp.asarray(chain.jumps), 1)])
         # Beyond the last sample is a row that nothing reads.
-        enter = lax.dynamic_update_index_in_dim(enter, _entering(left, jnp.asarray(chain.jumps)), t, 0)
+        enter = lax.dynamic_update_index_in_dim(enter, entering, t, 0)
         return enter, leave, window
 
     nothing = jnp.full((len(x) + 1, x.shape[1]), NEVER)

@@ -62,7 +62,7 @@ def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
     Raises:
         InfeasibleAlignment, ValueError: see the module.
     """
-    if _single(log_likelihoods, chain):
+    if getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain):
         return _run(_viterbi, log_likelihoods, chain, lengths, parallel=parallel)
     tables, chains = recordings(log_likelihoods, chain, lengths)
     found = run_many(_viterbi, tables, chains, parallel=parallel)
@@ -223,10 +223,6 @@ def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tup
 
 
 # How they are called.
-
-
-def _single(log_likelihoods: Any, chain: Any) -> bool:
-    return getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain)
 
 
 def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,

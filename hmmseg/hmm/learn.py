@@ -1,18 +1,17 @@
 """Expectation maximisation of a task's hidden Markov model, trials of any lengths pooled.
 
-One driver for every kind of recording. What the states look like is an `Emission`, how long they last a
-`Durations`; both hold the trials' data, so that the driver sees nothing but log-likelihoods (num_timesteps,
-num_states) and posterior state probabilities of the same shape. A network's emissions need no driver: their
-gradient is that of `hmmseg.hmm.log_evidence` (docs/hmm.md).
+What the states look like and how long they last is the caller's: the driver sees nothing but log-likelihoods
+(num_timesteps, num_states), chains, and posterior state probabilities of the same shape. A network's
+emissions need no driver: their gradient is that of `hmmseg.hmm.log_evidence` (docs/hmm.md).
 
 Dempster, Laird and Rubin, J. R. Stat. Soc. B 39, 1977; Rabiner, Proc. IEEE 77(2), 1989.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar, runtime_checkable
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -20,46 +19,15 @@ from hmmseg.hmm.chain import Chain
 from hmmseg.hmm.inference import align
 from hmmseg.hmm.results import AlignmentPosterior
 
-S = TypeVar("S")
+M = TypeVar("M")
 LEAST_ITERATIONS = 6  # numerics: before the evidence may have settled
 
 
-@runtime_checkable
-class Emission(Protocol):
-    """What each state looks like; frozen, an update is a new object."""
-
-    def log_likelihoods(self, trial: int) -> np.ndarray:
-        """Log-likelihoods (num_timesteps, num_states) of one trial, -inf where a state cannot be."""
-        ...
-
-    def updated(self: S, responsibilities: Sequence[np.ndarray]) -> S:
-        """The M-step, given posterior state probabilities (num_timesteps, num_states) a trial."""
-        ...
-
-
-@runtime_checkable
-class Durations(Protocol):
-    """How states follow each other; frozen, an update is a new object."""
-
-    def chain(self, trial: int) -> Chain:
-        """The chain of one trial."""
-        ...
-
-    def updated(self: S, responsibilities: Sequence[np.ndarray]) -> S:
-        """The M-step, as of an emission."""
-        ...
-
-
-E = TypeVar("E", bound=Emission)
-D = TypeVar("D", bound=Durations)
-
-
 @dataclass(frozen=True)
-class Learned(Generic[E, D]):
+class Learned(Generic[M]):
     """A fitted model; every trial's most probable path and posterior are those under it."""
 
-    emission: E
-    durations: D
+    model: M
     alignments: tuple[AlignmentPosterior, ...]
     num_iterations: int
     converged: bool
@@ -69,29 +37,24 @@ class Learned(Generic[E, D]):
         """Log evidence of all trials [nats]."""
         return sum(each.log_evidence for each in self.alignments)
 
-    @property
-    def responsibilities(self) -> list[np.ndarray]:
-        """Posterior state probabilities (num_timesteps, num_states) of every trial."""
-        return [each.smoothed for each in self.alignments]
 
-
-def expectation(emission: Emission, durations: Durations, num_trials: int) -> tuple[AlignmentPosterior, ...]:
-    """Paths and posteriors of all trials; raises InfeasibleAlignment where a trial has no path."""
-    tables = [emission.log_likelihoods(i) for i in range(num_trials)]
-    return tuple(align(tables, [durations.chain(i) for i in range(num_trials)]))
-
-
-def em(emission: E, durations: D, num_trials: int, max_iterations: int = 40,
-       tolerance: float = 1e-3) -> Learned[E, D]:  # fmt: skip
+def em(model: M, tables: Callable[[M], tuple[Sequence[np.ndarray], Sequence[Chain]]],
+       updated: Callable[[M, Sequence[np.ndarray]], M], max_iterations: int = 40,
+       tolerance: float = 1e-3) -> Learned[M]:  # fmt: skip
     """Expectation and maximisation in turn, until the log evidence changes by less than `tolerance` nats.
 
     The last step is an expectation.
 
     Args:
-        emission, durations: where it starts.
-        num_trials: of the data that these hold.
+        model: where it starts.
+        tables: of a model, each trial's log-likelihoods (num_timesteps, num_states), -inf where a state
+            cannot be, and its chain.
+        updated: the M-step: a model anew, given each trial's posterior state probabilities.
         max_iterations: after which it ends unconverged.
         tolerance: nats.
+
+    Returns:
+        The model at the end.
 
     Raises:
         InfeasibleAlignment: a trial is too short for its states.
@@ -99,10 +62,10 @@ def em(emission: E, durations: D, num_trials: int, max_iterations: int = 40,
     """
     before = -np.inf
     for iteration in range(1, max_iterations + 1):
-        fit = Learned(emission, durations, expectation(emission, durations, num_trials), iteration, False)
+        fit = Learned(model, tuple(align(*tables(model))), iteration, False)
         if iteration > LEAST_ITERATIONS and abs(fit.log_evidence - before) < tolerance:
-            return Learned(emission, durations, fit.alignments, iteration, True)
+            return Learned(model, fit.alignments, iteration, True)
         if iteration < max_iterations:
-            before, responsibilities = fit.log_evidence, fit.responsibilities
-            emission, durations = emission.updated(responsibilities), durations.updated(responsibilities)
+            before = fit.log_evidence
+            model = updated(model, [each.smoothed for each in fit.alignments])
     return fit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,18 +15,12 @@ def crossings(moves: Sequence[Any]) -> Any:
     """Probabilities that each boundary is crossed, from those of moves by one state, two, ..."""
     if len(moves) == 1:
         return moves[0]
-    xp = np if isinstance(moves[0], np.ndarray) else _jax_numpy()
+    xp = np if isinstance(moves[0], np.ndarray) else importlib.import_module("jax.numpy")
     width, crossed = moves[0].shape[1], 0.0
     for d, band in enumerate(moves, 1):
         for by in range(min(d, width)):  # a move by d states from k crosses the boundaries k to k + d - 1
             crossed = crossed + xp.pad(band, ((0, 0), (by, width - by - band.shape[1])))
     return crossed
-
-
-def _jax_numpy() -> Any:
-    import jax.numpy
-
-    return jax.numpy
 
 
 @register_dataclass

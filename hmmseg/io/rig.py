@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from hmmseg.errors import nearest
 from hmmseg.io.schema import (
@@ -79,18 +79,14 @@ class Gripper(StrictTable):
     motor_current: Name | None = None
     force_per_ampere: FinitePositive | None = None
 
-    @field_validator("wrench")
+    @field_validator("wrench", "opening")
     @classmethod
-    def _three_or_six(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if len(names) not in (3, 6):
-            raise ValueError(f"has {len(names)} columns; expected 3 forces, or 3 forces and 3 torques")
-        return names
-
-    @field_validator("opening")
-    @classmethod
-    def _one_or_two(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if len(names) not in (1, 2):
-            raise ValueError(f"has {len(names)} columns; expected one, or one for each finger")
+    def _whole(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        counts, expected = (3, 6), "3 forces, or 3 forces and 3 torques"
+        if info.field_name == "opening":
+            counts, expected = (1, 2), "one, or one for each finger"
+        if len(names) not in counts:
+            raise ValueError(f"has {len(names)} columns; expected {expected}")
         return names
 
     @field_validator("sensor_axes")

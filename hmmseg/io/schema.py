@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 import typing
@@ -93,6 +94,19 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     if len(content) > MAX_TOML_BYTES:
         raise InputError(str(path), f"larger than {MAX_TOML_BYTES} bytes", "a TOML file")
     return parse_toml(text, str(path))
+
+
+def read_json(path: str | Path, expected: str) -> dict[str, Any]:
+    """Table of a JSON file; InputError, which says what was `expected`, for an absent or malformed file."""
+    try:
+        table = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(str(path), "no such file", expected) from None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(str(path), f"not valid JSON ({error})", expected) from None
+    if not isinstance(table, dict):
+        raise InputError(str(path), "holds no table", expected)
+    return table
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:

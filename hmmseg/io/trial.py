@@ -14,7 +14,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.table import Table, check_unique, numbers, times
 from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import LARGEST, LATEST, Column, measures, si_factor, source_of, unwrapped
-from hmmseg.tables import Tabled
+from hmmseg.tables import Tabled, listed
 
 JOINT_CHANNELS = ("q11", "q12", "dq11", "dq12", "fx1", "fy1", "q21", "q22", "dq21", "dq22", "fx2", "fy2")
 CARTESIAN_CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
@@ -82,17 +82,13 @@ class Trial(Tabled):
 
     def tables(self) -> list[Any]:
         """Its channels, with how many samples each lacks and how far it goes."""
-        from rich.table import Table as Shown
-
-        size = f"{self.t.size} samples at {self.rate:.4g} Hz, {self.t[0]:.4g} to {self.t[-1]:.4g} s"
-        table = Shown(title=f"{self.name}: {size}", title_justify="left")
-        for head in ("channel", "missing", "least", "most"):
-            table.add_column(head)
+        size, rows = f"{self.t.size} samples at {self.rate:.4g} Hz", []
         for name, values in self.channels.items():
             there = values[np.isfinite(values)]
             ends = (f"{there.min():.4g}", f"{there.max():.4g}") if there.size else ("", "")
-            table.add_row(name, str(values.size - there.size or ""), *ends)
-        return [table]
+            rows.append((name, str(values.size - there.size or ""), *ends))
+        title = f"{self.name}: {size}, {self.t[0]:.4g} to {self.t[-1]:.4g} s"
+        return [listed(title, ("channel", "missing", "least", "most"), rows, wraps=True)]
 
     @property
     def rate(self) -> float:
@@ -118,17 +114,26 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
     """
     names, optional = channels_of(rig, task)
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
-    _check_lengths(table)
+    for name, values in table.columns.items():
+        if len(values) != table.rows.size:
+            raise InputError(f"{table.file}: column {name}", f"has {len(values)} rows",
+                             f"{table.rows.size} as in the others")  # fmt: skip
     _check_names(table, columns, names, optional, task is not None)
     t, origin = mapped_times(table, rig)
     channels: dict[str, np.ndarray] = {}
-    for name in names if names is not None else _every(table, columns):
+    if names is None:  # all channels of a plain task: what is mapped by our name, the rest by its own
+        mapped = {source_of(name, columns): name for name in columns}
+        names = tuple(mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t")
+    for name in names:
         theirs_name = source_of(name, columns)
         if theirs_name not in table.columns:
             continue
         values = _mapped(numbers(table, theirs_name), name, columns, table)
-        if task is None:
-            _check_size(values, theirs_name, table)
+        beyond = np.flatnonzero(np.abs(np.nan_to_num(values)) > LARGEST)
+        if task is None and beyond.size:
+            raise InputError(f"{table.file}: row {table.rows[beyond[0]]}, column {theirs_name}",
+                             f"{values[beyond[0]]:.3g} is no reading of a hand's sensor",
+                             f"at most {LARGEST:.0g} in SI units")  # fmt: skip
         if not whole or np.isfinite(values).any():
             channels[name] = unwrapped(values) if measures(name) == "angle" and task is None else values
         elif name not in optional:  # an optional one without values is as good as absent
@@ -152,15 +157,6 @@ def mapped_times(table: Table, rig: Rig | None) -> tuple[np.ndarray, int | None]
     return t, origin
 
 
-def _check_size(values: np.ndarray, name: str, table: Table) -> None:
-    """InputError for the first row of a hand's channel (num_rows,) that no sensor can have read."""
-    beyond = np.flatnonzero(np.abs(np.nan_to_num(values)) > LARGEST)
-    if beyond.size:
-        raise InputError(f"{table.file}: row {table.rows[beyond[0]]}, column {name}",
-                         f"{values[beyond[0]]:.3g} is no reading of a hand's sensor",
-                         f"at most {LARGEST:.0g} in SI units")  # fmt: skip
-
-
 def channels_of(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
     """Channels of the hand or the task (None: all there are), and which of them may be absent."""
     if task is not None:
@@ -171,12 +167,6 @@ def channels_of(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, 
     if rig.jointed:
         return JOINT_CHANNELS, ()
     return (*CARTESIAN_CHANNELS, ROLL), (*CARTESIAN_OPTIONAL, ROLL)
-
-
-def _every(table: Table, columns: Mapping[str, Column]) -> list[str]:
-    """All channels of a plain task: what is mapped by our name, the rest by its own."""
-    mapped = {source_of(name, columns): name for name in columns}
-    return [mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t"]
 
 
 def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,
@@ -204,13 +194,6 @@ def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, 
         raise InputError(where, "has no columns but t", "at least one channel")
 
 
-def _check_lengths(table: Table) -> None:
-    for name, values in table.columns.items():
-        if len(values) != table.rows.size:
-            raise InputError(f"{table.file}: column {name}", f"has {len(values)} rows",
-                             f"{table.rows.size} as in the others")  # fmt: skip
-
-
 def _mapped(values: np.ndarray, ours: str, columns: Mapping[str, Column], table: Table) -> np.ndarray:
     """Values in SI: the mapping's unit, or the one that the file itself states."""
     entry = columns.get(ours, Column())
@@ -224,14 +207,10 @@ def _check_times(t: np.ndarray, table: Table) -> None:
     where, rows = table.file, table.rows
     if t.size < MIN_SAMPLES:
         raise InputError(where, f"has {t.size} samples", f"at least {MIN_SAMPLES}")
-    missing = np.flatnonzero(~np.isfinite(t))
-    if missing.size:
-        raise InputError(f"{where}: row {rows[missing[0]]}, column t", "missing", "a time in s")
-    beyond = np.flatnonzero(np.abs(t) > LATEST)
-    if beyond.size:
-        raise InputError(
-            f"{where}: row {rows[beyond[0]]}, column t", f"{t[beyond[0]]:.3g} is no time", "a time in s"
-        )
+    for bad, problem in ((~np.isfinite(t), "missing"), (np.abs(t) > LATEST, "{:.3g} is no time")):
+        if bad.any():
+            i = int(bad.argmax())
+            raise InputError(f"{where}: row {rows[i]}, column t", problem.format(t[i]), "a time in s")
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         i = back[0] + 1

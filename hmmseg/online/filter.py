@@ -370,11 +370,8 @@ class Filter:
     def snapshot(self) -> Any:
         """All that changes, to return to with `restore`."""
         s = self._state
-        big = (
-            s.rows[: s.count].tobytes(),
-            s.known[: s.count].copy(),
-            s.ring.tobytes(),
-        )  # named ones copy slowly
+        # Named arrays copy slowly.
+        big = s.rows[: s.count].tobytes(), s.known[: s.count].copy(), s.ring.tobytes()
         small = copy.copy(s), s.extremes.copy(), s.ranges.copy()
         return small, big, len(self.crossings), list(self._waiting), self._now.copy()
 

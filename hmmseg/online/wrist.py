@@ -16,6 +16,7 @@ import math
 from bisect import insort
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,7 +38,7 @@ from hmmseg.hand.wrist import (
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
 from hmmseg.levels import MOVED, SURE
-from hmmseg.robust import NORMAL, bridged, robust_sd
+from hmmseg.robust import bridged, robust_sd, white_sd
 
 WHERE = "stream"
 BATCH = 0.02  # numerics: s that are turned into fingers together
@@ -115,10 +116,11 @@ class Wrist:
         """Rows that are ready now, each once; with `final` all that are left."""
         if not self._rows:
             return []
-        newest = self._rows[-1][0]
+        newest = self.newest
         if self.tool is None and not (self._opening.number or final):
-            while self._rows[0][0] < newest - BACKLOG:
-                self._collect_before_forgetting(newest)
+            if self._rows[0][0] < newest - BACKLOG:  # older free motion is kept as what it says of the tool
+                self._gather(newest - BACKLOG / 2)
+                self._rows = [each for each in self._rows if each[0] >= newest - BACKLOG / 2]
             return []
         window = self._window or 0.0
         until = newest if final else min(newest - window, self._opening.known)
@@ -139,12 +141,6 @@ class Wrist:
         self._free_until = min(self._free_until, self._out)
         self._went = Went()
 
-    def _collect_before_forgetting(self, newest: float) -> None:
-        """Free motion longer ago than the backlog is kept as what it says of the tool."""
-        half = newest - BACKLOG / 2
-        self._gather(half)
-        self._rows = [each for each in self._rows if each[0] >= half]
-
     def _trial(self, rows: list[tuple[float, tuple[float, ...]]]) -> Trial:
         values = np.array([row for _, row in rows])
         return Trial(WHERE, np.array([t for t, _ in rows]),
@@ -154,19 +150,19 @@ class Wrist:
         """Whether every channel has a value to smooth."""
         return trial.t.size > 3 and all(np.isfinite(c).any() for c in trial.channels.values())
 
+    def _opened(self, trial: Trial) -> np.ndarray:
+        """Opening (num_timesteps,) [m], gaps bridged."""
+        return np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
+
     def _gather(self, until: float) -> None:
         """Add free motion up to `until` to what the tool is found from."""
         trial = self._trial(self._rows)
         if not self._there(trial):
             return
         pose = pose_of(trial, self.gripper, self._window)
-        if self._window is None:
-            self._window = pose.window
-        opening = np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
-        free = np.array(
-            [self._opening.free(t, o) for t, o in zip(trial.t.tolist(), opening.tolist(), strict=True)]
-        )
-        free &= (trial.t > self._free_until) & (trial.t <= until)
+        self._window = pose.window
+        opening = self._opened(trial)
+        free = self._opening.free(trial.t, opening) & (trial.t > self._free_until) & (trial.t <= until)
         step = max(1, round(self._window / APART / float(np.median(np.diff(trial.t)))))
         picked = np.flatnonzero(free)[::step]
         self._free_until = max(self._free_until, min(until, float(trial.t[-1])))
@@ -182,13 +178,11 @@ class Wrist:
 
     def _find_tool(self) -> None:
         self._fitted = self._opening.number
-        parts = list(self._free)
+        parts = [FreeMotion(np.zeros(0), np.zeros((0, 3)), np.zeros((4, 0, 3)), 0.0), *self._free]
         motion = FreeMotion(
-            np.concatenate([p.t for p in parts]) if parts else np.zeros(0),
-            np.concatenate([p.force for p in parts]) if parts else np.zeros((0, 3)),
-            np.concatenate([p.terms for p in parts], axis=1) if parts else np.zeros((4, 0, 3)),
-            self._window or 0.0,
-        )
+            np.concatenate([p.t for p in parts]), np.concatenate([p.force for p in parts]),
+            np.concatenate([p.terms for p in parts], axis=1), self._window or 0.0,
+        )  # fmt: skip
         if self.tool is not None and motion.t.size < 1:
             return
         since = float(motion.t.mean()) if motion.t.size else 0.0
@@ -217,20 +211,16 @@ class Wrist:
 
     def _as_rows(self, trial: Trial, tool: Tool, until: float) -> list[tuple[float, np.ndarray]]:
         pose = pose_of(trial, self.gripper, self._window)
-        opening = np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
-        force = applied_force(trial, self.rig, pose, tool)
-        grips = []
+        force, near, grips = applied_force(trial, self.rig, pose, tool), np.zeros(trial.t.size), []
         for held in self._opening.grips:
-            start, stop = np.searchsorted(trial.t, [held.start, held.stop])
+            start, stop = np.searchsorted(trial.t, [held.start, held.stop]).tolist()
             if stop > start:
-                grips.append(Grip(int(start), int(stop), held.grip.held, held.grip.width, held.grip.width_sd))
-        found = as_fingers(trial, self.rig, pose, tool, opening, force, grips,
-                           grip_force_of(trial, self.gripper))  # fmt: skip
-        near = np.zeros(trial.t.size)
-        for each in grips:
-            near[max(each.start - 1, 0) : each.stop + 1] = 1.0
+                grips.append(replace(held.grip, start=start, stop=stop))
+                near[max(start - 1, 0) : stop + 1] = 1.0
         for each in grips:
             near[each.start + 1 : each.stop - 1] = 2.0
+        found = as_fingers(trial, self.rig, pose, tool, self._opened(trial), force, grips,
+                           grip_force_of(trial, self.gripper))  # fmt: skip
         self._decide(trial, pose, force, tool, until)
         if self._opening.held is not None:
             self.force_sd = max(self.force_sd, tool.drift_sd * abs(until - tool.since))
@@ -269,11 +259,9 @@ class Wrist:
         rows = [each for each in self._rows if each[0] >= t[0]]
         if not rows:
             return None
-        trial = self._trial(rows)
-        pressing = grip_force_of(trial, self.gripper)
+        trial, last = self._trial(rows), len(rows) - 1
         way = np.interp(trial.t, t, opening)
-        last = len(rows) - 1
-        return give_of(self.rig, pressing, way, (0, last, last))
+        return give_of(self.rig, grip_force_of(trial, self.gripper), way, (0, last, last))
 
 
 def checked(rig: Rig, t: float, row: np.ndarray) -> None:
@@ -295,11 +283,13 @@ NOISE = 200  # numerics: samples that determine the opening's noise
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
 
 
+@dataclass
 class Held:
     """One grip: from `start` to `stop` [s], inf while it lasts; `grip` as off line."""
 
-    def __init__(self, start: float, grip: Grip) -> None:
-        self.start, self.stop, self.grip = start, math.inf, grip
+    start: float
+    grip: Grip
+    stop: float = math.inf
 
 
 class Closings:
@@ -331,42 +321,34 @@ class Closings:
         """Least motion of the opening that counts [m]."""
         return max(REST * (self._high - self._low), 2 * SURE * self._noise, LEAST_CLOSING)
 
-    def free(self, t: float, opening: float) -> bool:
-        """Whether a sample is surely of free motion: outside of every grip, more open than halfway."""
+    def free(self, t: np.ndarray, opening: np.ndarray) -> np.ndarray:
+        """Which samples are surely of free motion: outside of every grip, more open than halfway."""
+        free = t <= self.known
         for held in self.grips:
-            if t >= held.start and (t < held.stop or opening < (held.grip.held + self._high) / 2):
-                return False
-        return t <= self.known
+            free &= (t < held.start) | ((t >= held.stop) & (opening >= (held.grip.held + self._high) / 2))
+        return free
 
     def take(self, t: float, opening: float) -> None:
         """The next sample."""
-        self._learn_noise(opening)
+        self._recent.append(opening)
+        if self._seen < NOISE and len(self._recent) == NOISE // 10:
+            self._seen += NOISE // 10
+            self._noise = max(self._noise, white_sd(np.array(self._recent)))
+            self._recent.clear()
         self._low, self._high = min(self._low, opening), max(self._high, opening)
+        if not (self.held or self.closing or (self._kept and opening < self._kept[0][1])):
+            self._kept.clear()
+        self._kept.append((t, opening))
+        while t - self._kept[0][0] > REMEMBERED:
+            self._kept.popleft()
         if self.held is not None:
             self._hold(t, opening)
-            return
-        kept = self._kept
-        if not self.closing:
-            if not kept or opening >= kept[0][1]:
-                kept.clear()
-            self._keep(t, opening)
+        elif self.closing:
+            self._close(t, opening)
+        else:
             self.known = t
-            if opening < kept[0][1] - self.swing:
-                self.closing, self._fastest, self._slowed = True, 0.0, t
-                self._floor = opening
-            return
-        self._keep(t, opening)
-        self._close(t, opening)
-
-    def _learn_noise(self, opening: float) -> None:
-        """Noise of one sample [m] from second differences, as off line."""
-        self._recent.append(opening)
-        n = len(self._recent)
-        if self._seen < NOISE and n == NOISE // 10:
-            self._seen += n
-            bent = np.abs(np.diff(self._recent, 2))
-            self._noise = max(self._noise, NORMAL * float(np.median(bent)) / np.sqrt(6))
-            self._recent.clear()
+            if opening < self._kept[0][1] - self.swing:
+                self.closing, self._fastest, self._slowed, self._floor = True, 0.0, t, opening
 
     def _speed(self, over: float) -> float:
         """Closing speed over the last `over` s [m/s]."""
@@ -404,7 +386,6 @@ class Closings:
 
     def _hold(self, t: float, opening: float) -> None:
         held = self.grips[-1]
-        self._keep(t, opening)
         self._floor = min(self._floor, opening)
         if opening < held.grip.held - self.swing:  # it had only paused
             self.refused = self.grips.pop()
@@ -424,11 +405,6 @@ class Closings:
         """The grip that lasts turns out to hold nothing."""
         self.refused = self.grips.pop()
         self._open(*self._kept[-1])
-
-    def _keep(self, t: float, opening: float) -> None:
-        self._kept.append((t, opening))
-        while t - self._kept[0][0] > REMEMBERED:
-            self._kept.popleft()
 
     def _open(self, t: float, opening: float) -> None:
         self.closing, self.known = False, t

@@ -31,7 +31,8 @@ def stacked_panels(
     axes = list(np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)))
     for ax, panel in zip(axes, panels, strict=True):
         # Single samples between missing ones would not show as a line.
-        alone = np.isfinite(panel.values) & ~_beside_another(panel.values)
+        there = np.r_[False, np.isfinite(panel.values), False]
+        alone = there[1:-1] & ~there[:-2] & ~there[2:]
         ax.plot(t, panel.values, color=INK, lw=0.8)
         ax.plot(t[alone], panel.values[alone], ".", color=INK, ms=1.5)
         ax.set_ylabel(panel.label)
@@ -45,13 +46,11 @@ def stacked_panels(
         figure.suptitle(
             f"does not fit its task at {segmentation.failed.label}", fontsize=8, fontweight="bold"
         )
-    state_legend(figure, segmentation)
+    colours = state_colours([span.state for span in segmentation.spans])
+    handles = [Patch(color=colour, alpha=0.32, lw=0, label=state) for state, colour in colours.items()]
+    handles.append(Patch(facecolor=INK, alpha=0.28, lw=0, label="boundary, 90 % interval"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5))
     return axes
-
-
-def _beside_another(values: np.ndarray) -> np.ndarray:
-    there = np.concatenate([[False], np.isfinite(values), [False]])
-    return there[:-2] | there[2:]
 
 
 def shade_spans(ax: Axes, segmentation: Segmentation) -> None:
@@ -73,11 +72,3 @@ def name_spans(ax: Axes, segmentation: Segmentation) -> None:
             textcoords="offset points", rotation=LABEL_SLANT, ha="left", va="bottom",
             rotation_mode="anchor", fontsize=7,
         )  # fmt: skip
-
-
-def state_legend(figure: Figure, segmentation: Segmentation) -> None:
-    """Legend of the states and of a boundary, below all panels."""
-    colours = state_colours([span.state for span in segmentation.spans])
-    handles = [Patch(color=colour, alpha=0.32, lw=0, label=state) for state, colour in colours.items()]
-    handles.append(Patch(facecolor=INK, alpha=0.28, lw=0, label="boundary, 90 % interval"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 5))

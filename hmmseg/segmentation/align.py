@@ -24,7 +24,6 @@ from hmmseg.segmentation.changes import Change, Disagreement, disagreements
 from hmmseg.segmentation.conformity import (
     MAX_RATE,
     Conformity,
-    Plan,
     at,
     examine,
     explain,
@@ -167,12 +166,19 @@ def aligned_rounds(
         readings = [_read(r.part(p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
         pool = Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
     position = {i: j for j, i in enumerate(fitting)}
-    pieces = iter([
-        _aligned(reading, steps, pool, position[i]) if i in position
-        else _departed(reading, steps, of[i], pool)
-        for i, reading in enumerate(pool.readings)
-    ])  # fmt: skip
-    return pool, [[next(pieces) for _ in own] for own in every]
+    pieces = []
+    for i, (reading, verdict) in enumerate(zip(pool.readings, of, strict=True)):
+        if i not in position:
+            pieces.append(_departed(reading, steps, verdict, pool))
+            continue
+        alignment, changes = pool.fit.posteriors[position[i]], pool.changes[position[i]]
+        found = boundary_posteriors(
+            changes, pool.disagreement, reading.thinned.t, alignment, reading.fine.touches
+        )
+        spans = to_spans(steps, found, *reading.ends)
+        pieces.append(Piece(found, spans, None, float(alignment.log_evidence), *reading.ends))
+    each = iter(pieces)
+    return pool, [[next(each) for _ in own] for own in every]
 
 
 def performed(task: BlockTask, pieces: Sequence[Sequence[Piece]]) -> BlockTask:
@@ -203,22 +209,15 @@ def _rounds(
             return every, verdicts
 
 
-def _aligned(reading: Reading, steps: tuple[Subtask, ...], pool: Pool, j: int) -> Piece:
-    alignment, t = pool.fit.posteriors[j], reading.thinned.t
-    boundaries = boundary_posteriors(pool.changes[j], pool.disagreement, t, alignment, reading.fine.touches)
-    evidence = float(alignment.log_evidence)
-    spans = to_spans(steps, boundaries, *reading.ends)
-    return Piece(boundaries, spans, None, evidence, *reading.ends)
-
-
 def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity, pool: Pool) -> Piece:
     """A trial aligned with the order that it shows in place of its task's."""
     assert verdict.failing is not None
     shown = plan(verdict, steps)
-    own, evidence = _fit_shown(reading.features, shown, verdict)
-    found = ()
-    if own is not None:
+    found, evidence = (), verdict.log_evidence
+    if any(s.state != FREE for s in shown.steps):  # something is held: it is fitted to the order it shows
+        own = fit([reading.features], shown.steps, shown.start)
         alignment = own.posteriors[0]
+        evidence = float(alignment.log_evidence)
         changes = contact_changes(
             reading.fine, reading.thinned, pool.sensing, shown.steps, own.parameters, alignment
         )
@@ -277,14 +276,6 @@ def _continued(before: list[Span], after: Sequence[Span]) -> list[Span]:
         free = replace(before[-1], end=after[0].end, end_sd=after[0].end_sd, end_90=after[0].end_90)
         return [*before[:-1], free, *after[1:]]
     return [*before, *after]
-
-
-def _fit_shown(f: Features, shown: Plan, verdict: Conformity) -> tuple[Fit | None, float]:
-    """Fit of one trial to the order it shows, and its log evidence; no fit where nothing is held."""
-    if all(s.state == FREE for s in shown.steps):
-        return None, verdict.log_evidence
-    own = fit([f], shown.steps, shown.start)
-    return own, float(own.posteriors[0].log_evidence)
 
 
 @dataclass(frozen=True, repr=False)

@@ -66,8 +66,8 @@ class Crossing:
 
 def log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     """Rice's formula on the cubic that joins both ends, give or take a bend [m] amid them."""
-    h00, h10, h01, h11 = _hermite(u)
-    d00, d10, d01, d11 = _hermite_slopes(u)
+    h00, h10, h01, h11 = 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u, -2 * u**3 + 3 * u**2, u**3 - u**2
+    d00, d10, d01, d11 = 6 * u**2 - 6 * u, 3 * u**2 - 4 * u + 1, -6 * u**2 + 6 * u, 3 * u**2 - 2 * u
     value = h00 * c.left + h10 * h * c.v_left + h01 * c.right + h11 * h * c.v_right
     slope = (d00 * c.left + d01 * c.right) / h + d10 * c.v_left + d11 * c.v_right
     unseen = c.right - c.left - h * (c.v_left + c.v_right) / 2
@@ -116,21 +116,20 @@ def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phas
     rate, rate_at_hit = _minimum_jerk_slope(phase) / duration, _minimum_jerk_slope(at_hit) / duration
     gap, sd_v = -c.left, np.hypot(c.sd_v, SHAPE * max(c.v_left, -c.left / h))
     # Each reading ~ N(distance share, sd), the distance integrated out: gap and speed, and those before.
-    shares, readings = [way, rate], [(gap, c.sd_left), (c.v_left, sd_v)]
+    readings = [(way, gap, c.sd_left), (rate, c.v_left, sd_v)]
     if c.earlier is not None:
-        ago, value, speed_then = c.earlier
-        phase_then = phase - ago / duration
-        covered = value - c.left
-        shares += [
-            _minimum_jerk(phase_then) - _minimum_jerk(phase),
-            _minimum_jerk_slope(phase_then) / duration,
-        ]
-        readings += [(covered, np.hypot(np.sqrt(2.0) * c.sd_left, SHAPE * covered)),
-                     (speed_then, np.hypot(c.sd_v, SHAPE * max(speed_then, -covered / ago)))]  # fmt: skip
-    precision = sum((share / sd) ** 2 for share, (_, sd) in zip(shares, readings, strict=True))
-    weighed = sum(share * x / sd**2 for share, (x, sd) in zip(shares, readings, strict=True))
+        ago, value, speed = c.earlier
+        then, covered = phase - ago / duration, value - c.left
+        readings += [
+            (_minimum_jerk(then) - _minimum_jerk(phase), covered,
+             np.hypot(np.sqrt(2.0) * c.sd_left, SHAPE * covered)),
+            (_minimum_jerk_slope(then) / duration, speed,
+             np.hypot(c.sd_v, SHAPE * max(speed, -covered / ago))),
+        ]  # fmt: skip
+    precision = sum((share / sd) ** 2 for share, _, sd in readings)
+    weighed = sum(share * x / sd**2 for share, x, sd in readings)
     distance = np.maximum(weighed / precision, c.sd_left)
-    left_over = sum((x / sd) ** 2 for x, sd in readings) - weighed**2 / precision
+    left_over = sum((x / sd) ** 2 for _, x, sd in readings) - weighed**2 / precision
     log_before = -0.5 * left_over - 0.5 * np.log(precision) - np.log(distance)
     speed = np.maximum(distance * rate_at_hit, c.sd_v)
     stop = np.geomspace(*STOP, STOPS)[:, None, None, None]
@@ -187,14 +186,6 @@ def log_launch(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     return log_after + _log_normal(c.v_left, 0.75 * creep, np.hypot(c.sd_v, 0.25 * creep))
 
 
-def _hermite(u: np.ndarray) -> tuple[np.ndarray, ...]:
-    return 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u, -2 * u**3 + 3 * u**2, u**3 - u**2
-
-
-def _hermite_slopes(u: np.ndarray) -> tuple[np.ndarray, ...]:
-    return 6 * u**2 - 6 * u, 3 * u**2 - 4 * u + 1, -6 * u**2 + 6 * u, 3 * u**2 - 2 * u
-
-
 ONSET = 0.001  # prior: s; a pad's force leads its compression by its viscosity, a few ms in foam
 UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, against what g leaves out
 
@@ -239,28 +230,27 @@ def crossing_density(crossings: list[Crossing], width: float) -> np.ndarray:
     if not crossings:
         return flat
     if all(c.kind == "impact" for c in crossings):
-        last = np.diff(last_impact(crossings, width), prepend=0.0)
+        crossed = last_impact(crossings, width)
     else:
-        parts = [_single_density(c, width) for c in crossings]
-        last = np.diff(np.prod([np.cumsum(p) for p in parts], axis=0), prepend=0.0)
+        crossed = np.prod([_crossed(c, width) for c in crossings], axis=0)
+    last = np.diff(crossed, prepend=0.0)
     return (1 - UNIFORM) * last / last.sum() + UNIFORM * flat
 
 
-def _single_density(c: Crossing, h: float) -> np.ndarray:
+def _crossed(c: Crossing, h: float) -> np.ndarray:
+    """Probability (POINTS,) that one crossing has happened by each node of an interval of h s."""
     if c.kind == "impact":
-        return np.diff(last_impact([c], h), prepend=0.0)
-    u = (np.arange(POINTS) + 0.5) / POINTS
-    log_density = (log_smooth if c.kind == "smooth" else log_launch)(c, h, u)
+        return last_impact([c], h)
+    log_density = (log_smooth if c.kind == "smooth" else log_launch)(c, h, (np.arange(POINTS) + 0.5) / POINTS)
     density = np.exp(log_density - log_density.max())
-    return density / density.sum()
+    return np.cumsum(density / density.sum())
 
 
 def first_of(crossings: list[Crossing], width: float) -> np.ndarray:
     """Density (POINTS,) of the time at which the first of the crossings happens."""
     if not crossings:
         return crossing_density([], width)
-    survival = np.prod([1 - np.cumsum(_single_density(c, width)) for c in crossings], axis=0)
-    first = -np.diff(survival, prepend=1.0)
+    first = -np.diff(np.prod([1 - _crossed(c, width) for c in crossings], axis=0), prepend=1.0)
     return (1 - UNIFORM) * first / first.sum() + UNIFORM / POINTS
 
 

@@ -222,12 +222,10 @@ def cut(change: Change) -> Change | None:
 
 def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
     """What the changes of each sort show of where force and position disagree."""
-    sorts = dict.fromkeys(change.sort for change in changes)
-    return {
-        sort: Disagreement(_discrepancy(own), _loudness(changes, sort[1]))
-        for sort in sorts
-        for own in [[c for c in changes if c.sort == sort]]
-    }
+    by_sort: dict[tuple[Kind, int], list[Change]] = {}
+    for change in changes:
+        by_sort.setdefault(change.sort, []).append(change)
+    return {s: Disagreement(_discrepancy(own), _loudness(changes, s[1])) for s, own in by_sort.items()}
 
 
 def _discrepancy(changes: Sequence[Change]) -> float:
@@ -286,7 +284,11 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
     contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
     views, weight = [contacts], (1.0,)
     if change.slips:
-        sliding = [_beyond(c, slip) for c, slip in zip(contacts, change.slips, strict=True)]
+        sliding = [  # as far as they are deeper than where they slide
+            replace(c, pressed=np.maximum(c.pressed - slip, 0.0), place=c.place - slip,
+                    sd_place=float(np.hypot(c.sd_place, FRICTION * slip)))
+            for c, slip in zip(contacts, change.slips, strict=True)
+        ]  # fmt: skip
         opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
         views, weight = [contacts, sliding, opened], VIEWS
     found, t = [_seen(view, change, known) for view in views], contacts[0].t
@@ -294,12 +296,6 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
     times = np.concatenate([times for times, _ in found])
     masses = np.concatenate([w * mass / mass.sum() for w, (_, mass) in zip(weight, found, strict=True)])
     return blurred(times, masses, float(t[0]), float(t[-1]), sd)
-
-
-def _beyond(c: Penetration, slip: float) -> Penetration:
-    """The contact as far as it is deeper than where it slides [m]."""
-    sd = float(np.hypot(c.sd_place, FRICTION * slip))
-    return replace(c, pressed=np.maximum(c.pressed - slip, 0.0), place=c.place - slip, sd_place=sd)
 
 
 def _seen(

@@ -266,15 +266,19 @@ def conformity(
     Which of the trial's blocks is which object is the assignment of highest evidence among all
     tried (the first with which the trial fits, if any), unless `known` blocks say it.
     """
-    ways = assignments(free, steps)
-    if known:
-        fixed = _recognised(free, known)
-        ways = [assignment | fixed for assignment in ways]
-    found = []
+    ways, fixed, found = assignments(free, steps), dict[str, int | None](), []
+    for name, block in (known or {}).items():  # the nearest of the trial's that may be it, if any
+        alike = [i for i, own in enumerate(free.blocks) if own.like(block, BETWEEN_TRIALS)]
+        fixed[name] = min(alike, key=lambda i: abs(free.blocks[i].width - block.width), default=None)
+    ways = [assignment | fixed for assignment in ways]
     for assignment in ways:
         c = _compare(free, steps, assignment)
         while c.failing is not None and (lost := _lapses(c)):
-            c = _compare(_unread(c.free, lost), steps, assignment)
+            table, ringing, opened = c.free.table.copy(), c.free.ringing.copy(), c.free.opened.copy()
+            for span in lost:  # these samples say nothing
+                table[span], ringing[span], opened[span] = 0.0, 0.0, 0.0
+            unread = replace(c.free, table=table, ringing=ringing, opened=opened)
+            c = _compare(unread, steps, assignment)
         found.append(c)
         if c.failing is None:
             return c
@@ -295,23 +299,6 @@ def _lapses(c: Conformity) -> list[slice]:
     return out
 
 
-def _unread(free: FreeContacts, spans: Sequence[slice]) -> FreeContacts:
-    """The alternative without what some samples say."""
-    table, ringing, opened = free.table.copy(), free.ringing.copy(), free.opened.copy()
-    for span in spans:
-        table[span], ringing[span], opened[span] = 0.0, 0.0, 0.0
-    return replace(free, table=table, ringing=ringing, opened=opened)
-
-
-def _recognised(free: FreeContacts, known: dict[str, Block]) -> dict[str, int | None]:
-    """Nearest of the trial's blocks that may be the known one, None where there is none."""
-    out: dict[str, int | None] = {}
-    for name, block in known.items():
-        alike = [i for i, own in enumerate(free.blocks) if own.like(block, BETWEEN_TRIALS)]
-        out[name] = min(alike, key=lambda i: abs(free.blocks[i].width - block.width), default=None)
-    return out
-
-
 def assignments(free: FreeContacts, steps: Sequence[Subtask]) -> list[dict[str, int | None]]:
     """Assignments of the task's objects to the trial's blocks, likeliest first, MAX_ASSIGNMENTS at most.
 
@@ -319,16 +306,16 @@ def assignments(free: FreeContacts, steps: Sequence[Subtask]) -> list[dict[str, 
     grips them, one after the other, and as if it had one grip more, or one less, than the task; then any.
     """
     names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
-    numbers = range(len(free.blocks))
+    numbers, count = range(len(free.blocks)), len(names)
     if not numbers:
         return [dict.fromkeys(names)]
-    few = len(numbers) < len(names)  # some objects look alike, or are never touched
-    orders = (
-        itertools.product(numbers, repeat=len(names)) if few else itertools.permutations(numbers, len(names))
-    )
-    least = len(numbers) if few else len(names)
+    least = min(len(numbers), count)  # of fewer blocks some objects look alike, or are never touched
+    if len(numbers) < count:
+        every = itertools.product(numbers, repeat=count)
+    else:
+        every = itertools.permutations(numbers, count)
     out: list[dict[str, int | None]] = []
-    for order in itertools.chain(_as_gripped(free, steps, names), orders):
+    for order in itertools.chain(_as_gripped(free, steps, names), every):
         each: dict[str, int | None] = dict(zip(names, order, strict=True))
         if len(set(order)) == least and each not in out:
             out.append(each)
@@ -427,12 +414,9 @@ def plan(c: Conformity, steps: tuple[Subtask, ...]) -> Plan:
     failing = c.failing
     if failing is None:
         raise ValueError("the trial fits its task")
+    runs = list(c.runs)
     if c.wrong_rise is not None:  # other blocks or places than the task's: nothing after is the task's
-        runs = [
-            r if r.subtask is not None and r.subtask < failing else replace(r, subtask=None) for r in c.runs
-        ]
-    else:
-        runs = list(c.runs)
+        runs = [replace(r, subtask=None) if r.subtask is None or r.subtask >= failing else r for r in runs]
     before = sum(r.subtask is not None for r in runs)
     after = 0 if c.wrong_rise is not None else _matching(runs[before:], steps[failing + 1 :], c)
     own = {block: name for name, block in reversed(c.assignment.items()) if block is not None}
@@ -475,18 +459,9 @@ def task_boundaries(
 
     The failing subtask takes all that belongs to none; missing ones after it have no length.
     """
-    every = [at(first), *found, at(last)]  # every[i] is where step i starts
-    resume = every[len(shown.steps) - shown.num_after]
-    out = []
-    for k in range(1, num_subtasks):
-        back = num_subtasks - k
-        if k <= shown.num_before:
-            out.append(every[k])
-        elif back < shown.num_after:
-            out.append(every[len(shown.steps) - back])
-        else:
-            out.append(resume)
-    return tuple(out)
+    every, length = [at(first), *found, at(last)], len(shown.steps)  # every[i] is where step i starts
+    back = (min(num_subtasks - k, shown.num_after) for k in range(1, num_subtasks))
+    return tuple(every[k if k <= shown.num_before else length - b] for k, b in enumerate(back, 1))
 
 
 def at(t: float) -> BoundaryPosterior:

@@ -116,13 +116,6 @@ class Parameters:
     levels: tuple[dict[int, float], ...] = ()
 
 
-def _log_mostly(residual: np.ndarray, scale: np.ndarray, span: float, stray: float) -> np.ndarray:
-    """Log density of a residual that is small but for a share `stray` of samples; 0 where missing."""
-    close = np.log1p(-stray) + log_student(residual, scale)
-    either = np.logaddexp(close, np.log(stray) - np.log(span))
-    return np.where(np.isfinite(residual), either, 0.0)
-
-
 def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.ndarray,
                  broad_up: np.ndarray, stray: float) -> np.ndarray:  # fmt: skip
     """Log density of the motion of a block on its support: at rest, pushed aside, or astray altogether.
@@ -200,19 +193,17 @@ def log_likelihoods(
     held = _log_held(features, parameters, force)
     names = dict.fromkeys(str(s.object) for s in subtasks if s.state != FREE)
     grips = {name: held + _log_width(features, parameters, name) for name in names}
-    keys = [_alike(s, parameters, trial) for s in subtasks]
+    keys = []  # contact state, object and resting level [m]: what the emission of a subtask depends on
+    for s in subtasks:
+        rests = s.state not in (FREE, ABOVE_GROUND) and bool(parameters.levels)
+        level = parameters.levels[trial].get(s.index) if rests else None
+        keys.append((s.state, "" if s.state == FREE else str(s.object), level))
     found = {
         key: free if key[0] == FREE
         else _log_gripped(features, parameters, grips[key[1]], force, *key, stray)
         for key in dict.fromkeys(keys)
     }  # fmt: skip
     return np.stack([found[key] for key in keys], axis=1)
-
-
-def _alike(s: Subtask, p: Parameters, trial: int) -> tuple[str, str, float | None]:
-    """Contact state, object and resting level [m] of a subtask: what its emission depends on."""
-    rests = s.state not in (FREE, ABOVE_GROUND) and bool(p.levels)
-    return s.state, "" if s.state == FREE else str(s.object), p.levels[trial].get(s.index) if rests else None
 
 
 def _broad(f: Features, *names: str) -> np.ndarray:
@@ -236,8 +227,10 @@ def _log_width(f: Features, p: Parameters, name: str) -> np.ndarray:
     width = p.width.get(name)
     if width is None:  # the first pass knows neither widths nor where a block rests
         return _broad(f, "d")
-    spread = np.hypot(f.sd_d, p.scale["width"])
-    return _log_mostly(f.block_width(p.bias) - width, spread, f.span["d"], TOUCHING)
+    residual = f.block_width(p.bias) - width
+    close = np.log1p(-TOUCHING) + log_student(residual, np.hypot(f.sd_d, p.scale["width"]))
+    either = np.logaddexp(close, np.log(TOUCHING) - np.log(f.span["d"]))
+    return np.where(np.isfinite(residual), either, 0.0)
 
 
 def _log_gripped(
@@ -341,9 +334,8 @@ def without(f: Features, spans: Sequence[tuple[float, float]]) -> Features:
         out |= (f.t >= start) & (f.t <= end)
     if not out.any():
         return f
-    force = np.where(out[:, None], np.nan, f.force)
     blank = {name: np.where(out, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")}
-    return replace(f, force=force, **blank)
+    return replace(f, force=np.where(out[:, None], np.nan, f.force), **blank)
 
 
 def _range(values: np.ndarray, least: float) -> float:

@@ -8,7 +8,7 @@ of one task are pooled: they share weights, biases and scales, not the resting l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -62,45 +62,19 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
     return Parameters(bias, dict.fromkeys(names, weight), scale)
 
 
-@dataclass(frozen=True)
-class ContactEmission:
-    """The contact states of one task, learned from several trials together (an `Emission` of EM)."""
-
-    features: tuple[Features, ...]
-    subtasks: tuple[Subtask, ...]
-    parameters: Parameters
-
-    def log_likelihoods(self, trial: int) -> np.ndarray:
-        """Log-likelihoods (num_timesteps, num_subtasks) of one trial."""
-        return log_likelihoods(self.features[trial], self.subtasks, self.parameters, trial)
-
-    def updated(self, responsibilities: Sequence[np.ndarray]) -> ContactEmission:
-        """The M-step of every parameter."""
-        found = maximisation(self.features, self.subtasks, self.parameters, responsibilities)
-        return replace(self, parameters=found)
+def chain_of(shares: np.ndarray, length: int) -> Chain:
+    """Chain of geometric durations whose means are these shares (num_subtasks,) of a trial's samples."""
+    advance = np.clip(1.0 / np.maximum(shares * length, 1.5), 1e-6, 0.6)
+    return Chain(np.log1p(-advance), np.log(advance[:-1]))
 
 
-@dataclass(frozen=True)
-class MeanShares:
-    """Geometric durations whose means are the same share of every trial (`Durations` of EM).
+def mean_shares(gammas: Sequence[np.ndarray]) -> np.ndarray:
+    """Posterior mean shares (num_subtasks,) that subtasks take of every trial, given state probabilities.
 
-    `lengths` of the trials [samples], `shares` (num_subtasks,), under a Dirichlet prior of equal shares
-    that is worth one trial.
+    The prior is Dirichlet, of equal shares, and worth one trial.
     """
-
-    lengths: tuple[int, ...]
-    shares: np.ndarray
-
-    def chain(self, trial: int) -> Chain:
-        """Log probabilities to stay (num_subtasks,) and to advance (num_subtasks - 1,)."""
-        mean = np.maximum(self.shares * self.lengths[trial], 1.5)
-        advance = np.clip(1.0 / mean, 1e-6, 0.6)
-        return Chain(np.log1p(-advance), np.log(advance[:-1]))
-
-    def updated(self, responsibilities: Sequence[np.ndarray]) -> MeanShares:
-        """Posterior mean shares."""
-        counts = np.sum([g.sum(axis=0) / g.shape[0] for g in responsibilities], axis=0)
-        return replace(self, shares=(counts + 1.0 / counts.size) / (counts.sum() + 1.0))
+    counts = np.sum([g.mean(axis=0) for g in gammas], axis=0)
+    return (counts + 1.0 / counts.size) / (counts.sum() + 1.0)
 
 
 def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Parameters | None = None) -> Fit:
@@ -109,11 +83,19 @@ def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Para
     EM begins with `start`, or else with what `initial_parameters` makes of the trials.
     Raises `hmmseg.hmm.chain.InfeasibleAlignment` where a trial is too short for its subtasks.
     """
-    parameters = start or initial_parameters(features, subtasks)
-    emission = ContactEmission(tuple(features), subtasks, parameters)
+    Model = tuple[Parameters, np.ndarray]
+
+    def tables(model: Model) -> tuple[list[np.ndarray], list[Chain]]:
+        parameters, shares = model
+        lls = [log_likelihoods(f, subtasks, parameters, i) for i, f in enumerate(features)]
+        return lls, [chain_of(shares, f.t.size) for f in features]
+
+    def updated(model: Model, gammas: Sequence[np.ndarray]) -> Model:
+        return maximisation(features, subtasks, model[0], gammas), mean_shares(gammas)
+
     equal = np.full(len(subtasks), 1.0 / len(subtasks))
-    found = em(emission, MeanShares(tuple(f.t.size for f in features), equal), len(features))
-    return Fit(found.emission.parameters, found.alignments)
+    found = em((start or initial_parameters(features, subtasks), equal), tables, updated)
+    return Fit(found.model[0], found.alignments)
 
 
 def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],

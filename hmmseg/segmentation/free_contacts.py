@@ -20,7 +20,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense
 from hmmseg.levels import FIRM, MOVED, SURE
-from hmmseg.robust import NORMAL, median_of_known
+from hmmseg.robust import NORMAL, median_of_known, runs
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
@@ -127,12 +127,6 @@ def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
     return moving | np.all([np.abs(height - end) > least for end in ends[: 1 if guessing else 2]], axis=0)
 
 
-def runs(found: np.ndarray) -> list[tuple[int, int]]:
-    """Where each stretch of true samples starts and stops."""
-    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(int)))
-    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
 CLOSED = (
     1e-3  # prior: share of blocks released where they stand by fingers that slide off them, without opening
@@ -201,14 +195,13 @@ def _likeliest(f: Features, sliding: bool, bias: np.ndarray, scale: float, held:
     looks = [blocks_of(f, bias, held)]
     if any(np.isnan(b.weight) for b in looks[0]):
         looks.append(blocks_of(f, bias, held, guessing=True))
-    return max((_trained(f, sliding, bias, scale, blocks) for blocks in looks), key=_schwarz)
 
+    def evidence(fit: Trained) -> float:  # a width and a weight of each block paid for (Schwarz 1978)
+        states, blocks, _, table, _ = fit
+        num = len(blocks) + sum(np.isfinite(b.weight) for b in blocks)
+        return dense.log_evidence(table, *_any_order(states, len(table))) - 0.5 * num * np.log(len(table))
 
-def _schwarz(fit: Trained) -> float:
-    """Log evidence of a fit, a width and a weight of each block paid for (Schwarz, Ann. Stat. 6, 1978)."""
-    states, blocks, _, table, _ = fit
-    num = len(blocks) + sum(np.isfinite(b.weight) for b in blocks)
-    return dense.log_evidence(table, *_any_order(states, len(table))) - 0.5 * num * float(np.log(len(table)))
+    return max((_trained(f, sliding, bias, scale, blocks) for blocks in looks), key=evidence)
 
 
 def _trained(
@@ -229,7 +222,9 @@ def _trained(
             width={str(i): b.width for i, b in enumerate(blocks)},
         )
         states = _states(blocks, sliding)
-        table = free_table(f, states, parameters)
+        # Without levels. No free sample may ring, but just after a contact: whoever holds what the task does
+        # not name would pass for that.
+        table = log_likelihoods(f, _subtasks(states), replace(parameters, levels=()), 0, STRAY, rung=0.0)
         before, path = path, dense.viterbi(table, *_any_order(states, len(table))).path
         used = [i for i in range(len(blocks)) if any(states[k][1] == i for k in np.unique(path))]
         if not blocks or np.array_equal(path, before):
@@ -241,14 +236,11 @@ def _trained(
         if len(used) < len(blocks):  # a start that the model does not need
             blocks, path = tuple(blocks[i] for i in used), before[:0]
             continue
-        learned = maximisation([f], _subtasks(states), replace(parameters, levels=()),
-                               [np.eye(len(states))[path]])  # fmt: skip
-        parameters = replace(learned, levels=())
+        onehot, learned = np.eye(len(states))[path], replace(parameters, levels=())
+        parameters = replace(maximisation([f], _subtasks(states), learned, [onehot]), levels=())
+        widths, weights = parameters.width, parameters.weight
         blocks = tuple(
-            Block(
-                learned.width.get(str(i), b.width),
-                learned.weight[str(i)] if np.isfinite(b.weight) else np.nan,
-            )
+            Block(widths.get(str(i), b.width), weights[str(i)] if np.isfinite(b.weight) else np.nan)
             for i, b in enumerate(blocks)
         )
     return states, blocks, parameters, table, path
@@ -267,9 +259,7 @@ def _unweighed(states: States, path: np.ndarray, blocks: tuple[Block, ...]) -> t
     return tuple(kept)
 
 
-def _opened(
-    f: Features, states: tuple[tuple[str, int | None], ...], path: np.ndarray, bias: np.ndarray
-) -> np.ndarray:
+def _opened(f: Features, states: States, path: np.ndarray, bias: np.ndarray) -> np.ndarray:
     """Log-likelihoods (num_timesteps,) of the fingers' distance, if they release what stays between them.
 
     Pads that come off a block have been relaxed first: fingers are as far apart as it is wide. Where they are
@@ -286,9 +276,7 @@ def _opened(
     return np.logaddexp(np.log1p(-CLOSED) + chance, np.log(CLOSED))
 
 
-def _tapped(
-    states: tuple[tuple[str, int | None], ...], path: np.ndarray, interval: float, f: Features
-) -> list[slice]:
+def _tapped(states: States, path: np.ndarray, interval: float, f: Features) -> list[slice]:
     """Samples of touches too brief for a grip, of a block at rest that is gripped next.
 
     A touch lasts as long as it presses about as firmly as that grip.
@@ -307,16 +295,7 @@ def _tapped(
     return out
 
 
-def free_table(f: Features, states: tuple[tuple[str, int | None], ...], p: Parameters) -> np.ndarray:
-    """Log-likelihoods (num_timesteps, num_states) without levels.
-
-    No free sample may ring, but just after a contact: whoever holds what the task does not name would pass
-    for that.
-    """
-    return log_likelihoods(f, _subtasks(states), replace(p, levels=()), 0, STRAY, rung=0.0)
-
-
-def switching(states: tuple[tuple[str, int | None], ...], leave: float) -> np.ndarray:
+def switching(states: States, leave: float) -> np.ndarray:
     """Log transition probabilities that leave any state with probability `leave`.
 
     Any state may follow but another block's: a block changes only through free motion.
@@ -330,22 +309,18 @@ def switching(states: tuple[tuple[str, int | None], ...], leave: float) -> np.nd
     return out
 
 
-def _any_order(states: tuple[tuple[str, int | None], ...], n: int) -> tuple[np.ndarray, np.ndarray]:
+def _any_order(states: States, n: int) -> tuple[np.ndarray, np.ndarray]:
     return np.full(len(states), -np.log(len(states))), switching(states, min(0.5, 10.0 / n))
 
 
-def _states(blocks: tuple[Block, ...], sliding: bool) -> tuple[tuple[str, int | None], ...]:
-    held = [
-        (state, i)
-        for i, b in enumerate(blocks)
-        for state in (ON_GROUND, ABOVE_GROUND, SLIDING)
-        if (state != SLIDING or sliding) and (state != ABOVE_GROUND or np.isfinite(b.weight))
-    ]
-    return ((FREE, None), *held)
+def _states(blocks: tuple[Block, ...], sliding: bool) -> States:
+    out: list[tuple[str, int | None]] = [(FREE, None)]
+    for i, b in enumerate(blocks):
+        carried = [ABOVE_GROUND] * bool(np.isfinite(b.weight))
+        out += [(state, i) for state in (ON_GROUND, *carried, *[SLIDING] * sliding)]
+    return tuple(out)
 
 
-def _subtasks(states: tuple[tuple[str, int | None], ...]) -> tuple[Subtask, ...]:
-    return tuple(
-        Subtask(i, state, None if block is None else str(block), state, None)
-        for i, (state, block) in enumerate(states)
-    )
+def _subtasks(states: States) -> tuple[Subtask, ...]:
+    named = ((state, None if block is None else str(block)) for state, block in states)
+    return tuple(Subtask(i, state, block, state, None) for i, (state, block) in enumerate(named))

@@ -123,9 +123,18 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
     loads = [_loads(s, compliances) for s in squeezes]
 
     def profiled(values: np.ndarray, filtered: bool) -> np.ndarray:
-        log_likelihood = _log_filtered if filtered else _log_shifted
-        each = (log_likelihood(s, compliances, own, values) for s, own in zip(squeezes, loads, strict=True))
-        return (log_prior[:, None] + sum(each)).max(axis=0)
+        """Log-likelihoods (len(values),) of shifts, or of a filter's time constants [s]."""
+        total = log_prior[:, None]
+        for s, own in zip(squeezes, loads, strict=True):
+            if filtered:
+                place, share = _steps(s.t - s.t[0], own.shape[-1])
+                load, pace = lagging(own, np.exp(-STEP / values), place, share)
+            else:
+                clock = np.clip(s.t[:, None] - values, s.t[0], s.t[-1])
+                place, share = _steps(clock - s.t[0], own.shape[-1])
+                load, pace = (1 - share) * own[..., place] + share * own[..., place + 1]
+            total = total + _log_likelihood(s, compliances, load, pace)
+        return total.max(axis=0)
 
     log_lead = -((FINE / LEAD_SD) ** 2) / 2
     usual = profiled(FINE, False) + log_lead - np.logaddexp.reduce(log_lead)
@@ -141,22 +150,6 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
     return Lateness(mean, sd, bool(late), filtered)
 
 
-def _log_shifted(s: Squeeze, compliances: np.ndarray, loads: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """Log-likelihoods (num_compliances, num_shifts) of one squeeze."""
-    clock = np.clip(s.t[:, None] - shifts, s.t[0], s.t[-1])
-    load, pace = _at(loads, clock - s.t[0])
-    return _log_likelihood(s, compliances, load, pace)
-
-
-def _log_filtered(
-    s: Squeeze, compliances: np.ndarray, loads: np.ndarray, constants: np.ndarray
-) -> np.ndarray:
-    """Log-likelihoods (num_compliances, num_constants) of one squeeze."""
-    kept = np.exp(-STEP / constants)
-    load, pace = lagging(loads, kept, *_steps(s.t - s.t[0], loads.shape[-1]))
-    return _log_likelihood(s, compliances, load, pace)
-
-
 def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
     """Loads [N], and their rates, (2, num_compliances, num_steps) at each STEP from the first sample on."""
     there = np.nan_to_num(s.load)
@@ -170,25 +163,15 @@ def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
 
 def _joined(s: Squeeze, clock: np.ndarray) -> np.ndarray:
     """Distances [m] at times [s] of cubic Hermite pieces through the samples with their rates."""
-    before = np.clip(np.searchsorted(s.t, clock, side="right") - 1, 0, s.t.size - 2)
-    width = np.diff(s.t)[before]
-    u = (clock - s.t[before]) / width
-    left, right = s.distance[before], s.distance[before + 1]
-    start, end = width * s.rate[before], width * s.rate[before + 1]
-    bend = start + end - 2 * (right - left)
-    return left + u * (start + u * (3 * (right - left) - 2 * start - end + u * bend))
+    from scipy.interpolate import CubicHermiteSpline  # slow to import
+
+    return CubicHermiteSpline(s.t, s.distance, s.rate)(clock)
 
 
 def _steps(clock: np.ndarray, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
     """The STEP before each time [s] since the first, and how far it is on the way to the next."""
     place = np.minimum((clock / STEP).astype(int), num_steps - 2)
     return place, clock / STEP - place
-
-
-def _at(values: np.ndarray, clock: np.ndarray) -> np.ndarray:
-    """Values (..., num_steps) at times [s] since the first of them, linear between two."""
-    place, share = _steps(clock, values.shape[-1])
-    return (1 - share) * values[..., place] + share * values[..., place + 1]
 
 
 def _log_likelihood(s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace: np.ndarray) -> np.ndarray:

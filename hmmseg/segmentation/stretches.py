@@ -78,7 +78,11 @@ def find(readings: Sequence[Reading]) -> Toe:
     if not readings:
         return NONE
     usual = float(np.median([sd for *_, sd in readings]))
-    load, value, there = _padded(readings)
+    # Loads and values (num_stretches, N) of all stretches, and which are there; the rest is 0.
+    sizes = np.array([load.size for load, *_ in readings])
+    there = np.arange(sizes.max()) < sizes[:, None]
+    load, value = np.zeros((2, *there.shape))
+    load[there], value[there] = (np.concatenate([r[i] for r in readings]) for i in range(2))
     straight = _depths(load, value, np.zeros((1, *load.shape)), there, usual)[1]
     scale = max(usual, robust_sd(straight[0][there]))
     toes = np.stack([Toe(1.0, soft).give(load) for soft in SOFTS])
@@ -88,16 +92,6 @@ def find(readings: Sequence[Reading]) -> Toe:
     best = int(gain.argmax())
     sure = np.logaddexp.reduce(gain) - np.log(len(SOFTS)) > decisive(ROUNDED) and depth[best] > 0
     return Toe(float(depth[best]), SOFTS[best]) if sure else NONE
-
-
-def _padded(readings: Sequence[Reading]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Loads and values (num_stretches, N) of all stretches, and which are there; the rest is 0."""
-    size = max(load.size for load, *_ in readings)
-    there = np.arange(size) < np.array([load.size for load, *_ in readings])[:, None]
-    out = np.zeros((2, *there.shape))
-    for i in range(2):
-        out[i][there] = np.concatenate([r[i] for r in readings])
-    return out[0], out[1], there
 
 
 def _evidence(residual: np.ndarray, there: np.ndarray, scale: float) -> np.ndarray:

@@ -98,15 +98,11 @@ def agreement(labels: StateLabels, steps: tuple[Subtask, ...]) -> np.ndarray:
     Sliding counts as hold on ground, except next to a slide, from which it must be distinguished.
     """
     slid = {step.move for step in steps if step.state == SLIDING}
-    columns = []
-    for step in steps:
-        column = labels.state == NUMBERS[step.state]
-        if step.state == SLIDING:
-            column = column & labels.sliding
-        elif step.state == ON_GROUND and step.move in slid:
-            column = column & ~labels.sliding
-        columns.append(column)
-    return np.stack(columns, axis=1)
+    shown = np.stack([labels.state == NUMBERS[step.state] for step in steps], axis=1)
+    for k, step in enumerate(steps):
+        if step.move in slid and step.state in (SLIDING, ON_GROUND):
+            shown[:, k] &= labels.sliding == (step.state == SLIDING)
+    return shown
 
 
 def monotone_order(labels: StateLabels, steps: tuple[Subtask, ...]) -> Assignment:
@@ -120,64 +116,41 @@ def monotone_order(labels: StateLabels, steps: tuple[Subtask, ...]) -> Assignmen
     on_ground = np.array([step.state == ON_GROUND for step in steps])
     # Agreement decides; the 1 breaks ties in favour of holding on the ground.
     score = agrees * (labels.state.size + 1) + ((labels.state == 2)[:, None] & on_ground)
-    entries = _best_entries(agrees, score, may_skip=False)
-    if entries is None:
-        entries = _best_entries(agrees, score, may_skip=True) or {}
-    return _trimmed(agrees, entries)
+    entries = _best_entries(agrees, score, may_skip=False) or _best_entries(agrees, score, may_skip=True)
+    length, count = agrees.shape
+    first, last, hits = np.full(count, -1), np.full(count, -1), 0
+    for (s, start), stop in zip(entries, [start for _, start in entries[1:]] + [length], strict=False):
+        inside = np.flatnonzero(agrees[start:stop, s]) + start  # up to the last sample that agrees
+        first[s], last[s], hits = inside[0], inside[-1], hits + inside.size
+    return Assignment(first, last, hits / length)
 
 
-def _best_entries(agrees: np.ndarray, score: np.ndarray, may_skip: bool) -> dict[int, int] | None:
-    """First sample of every subtask on the best path {subtask: sample}; None if there is no path.
+def _best_entries(agrees: np.ndarray, score: np.ndarray, may_skip: bool) -> list[tuple[int, int]]:
+    """Subtasks and their first samples on the best path, in order; none if there is no path.
 
     A subtask may only be entered at a sample that agrees with it, which loses nothing: leading
-    samples that disagree serve the subtask before as well. best[s][t] is the score of the best
+    samples that disagree serve the subtask before as well. best[s + 1][t] is the score of the best
     path with the samples before t assigned and subtask s the last; the samples before the first
-    subtask's entry score nothing.
+    subtask's entry, best[0], score nothing.
     """
     length, count = agrees.shape
     total = np.vstack([np.zeros(count), np.cumsum(score, axis=0)])  # (length + 1, count)
-    origin, toll = np.zeros(length), JUMP * length * (length + 1)
-    best, entered, come_from = [], [], []
+    toll, best, entered, sources = JUMP * length * (length + 1), [np.zeros(length + 1)], [], []
     for s in range(count):
-        sources = [origin if not s else best[s - 1][:-1]]
-        names = [s - 1]
-        if may_skip and s:
-            jumps = [b[:-1] - toll for b in (np.append(origin, 0.0), *best[:-1])]
-            sources, names = [*sources, *jumps], [s - 1, *range(-1, s - 1)]
-        stacked = np.stack(sources)
-        chosen = np.argmax(stacked, axis=0)
-        gain = np.where(agrees[:, s], stacked.max(axis=0) - total[:-1, s], -np.inf)
+        ways = np.stack([best[s], *(b - toll for b in best[:s] if may_skip)])[:, :-1]
+        sources.append(np.r_[s - 1, -1 : s - 1][ways.argmax(axis=0)])
+        gain = np.where(agrees[:, s], ways.max(axis=0) - total[:-1, s], -np.inf)
         running = np.maximum.accumulate(gain)
-        best.append(np.concatenate([[-np.inf], running + total[1:, s]]))
-        entered.append(_last_rise(running))
-        come_from.append(np.asarray(names)[chosen])
-    s = int(np.argmax([b[-1] for b in best])) if may_skip else count - 1
-    if not np.isfinite(best[s][-1]):
-        return None
-    entries, end = {}, length
-    while s >= 0:
+        rises = np.r_[False, running[1:] > running[:-1]]  # the entry is where the maximum last rose
+        entered.append(np.maximum.accumulate(np.where(rises, np.arange(length), 0)))
+        best.append(np.r_[-np.inf, running + total[1:, s]])
+    s = int(np.argmax([b[-1] for b in best[1:]])) if may_skip else count - 1
+    entries, end = [], length
+    while s >= 0 and np.isfinite(best[s + 1][end]):
         entry = int(entered[s][end - 1])
-        entries[s] = entry
-        s, end = int(come_from[s][entry]), entry
-    return entries
-
-
-def _last_rise(running: np.ndarray) -> np.ndarray:
-    """Index at which a running maximum last rose, for every sample."""
-    rises = np.concatenate([[False], running[1:] > running[:-1]])
-    return np.maximum.accumulate(np.where(rises, np.arange(running.size), 0))
-
-
-def _trimmed(agrees: np.ndarray, entries: dict[int, int]) -> Assignment:
-    """Subtasks from their entry to their last sample that agrees."""
-    length, count = agrees.shape
-    first, last, hits = np.full(count, -1), np.full(count, -1), 0
-    order = sorted(entries)
-    for i, s in enumerate(order):
-        end = entries[order[i + 1]] if i + 1 < len(order) else length
-        inside = np.flatnonzero(agrees[entries[s] : end, s]) + entries[s]
-        first[s], last[s], hits = inside[0], inside[-1], hits + inside.size
-    return Assignment(first, last, hits / length)
+        entries.append((s, entry))
+        s, end = int(sources[s][entry]), entry
+    return entries[::-1]
 
 
 def segment_qualitative(

@@ -18,13 +18,15 @@ not grow with their number. It is that of a coarsened posterior (Miller and Duns
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import softmax
 
+from hmmseg.sequence.emissions import FLOORS, Learner
 from hmmseg.sequence.features import filled
-from hmmseg.sequence.learner import FLOORS, Learner
 
 MAX_BLOCKS = 250  # numerics: the cost table is quadratic in it
 
@@ -114,21 +116,17 @@ def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence
     trials teach first, and their stretches end where the labels are.
     """
     most = max(num_states, min(map(len, values)) // 2)
+    numbers = dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES)
+    labelled = [i for i, known in enumerate(labels) if np.isfinite(known).any()]
+    spread = np.linspace(0, len(values) - 1, min(TEACHERS, len(values))).round().astype(int)
+    teachers = list(dict.fromkeys([*labelled, *spread.tolist()]))[:TEACHERS]
     found: list[Course] = []
-    for number in dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES):
-        for i in _teachers(len(values), labels):
-            for floor in START_FLOORS:
-                course = _taught(values, number, i, floor, labels[i])
-                if not any(_alike(course, other) for other in found):
-                    found.append(course)
+    for number, i, floor in itertools.product(numbers, teachers, START_FLOORS):
+        course = _taught(values, number, i, floor, labels[i])
+        same = [other for other in found if other.ends.shape == course.ends.shape]
+        if not any(np.abs(other.ends - course.ends).max(initial=0.0) < SAME for other in same):
+            found.append(course)
     return found
-
-
-def _teachers(count: int, labels: Sequence[np.ndarray]) -> list[int]:
-    """Labelled trials, then others spread evenly."""
-    first = [i for i, known in enumerate(labels) if np.isfinite(known).any()]
-    spread = np.unique(np.linspace(0, count - 1, min(TEACHERS, count)).round().astype(int)).tolist()
-    return list(dict.fromkeys([*first, *spread]))[:TEACHERS]
 
 
 def _taught(
@@ -137,21 +135,21 @@ def _taught(
     """The course that starts from the optimal partition of one trial, whose stretches teach the others."""
     names, features = [f"{k}" for k in range(number)], values[0].shape[1]
     temper = 1 / features  # while learning, a cell counts as one observation
-    learner = Learner(values, names, [False] * number)
     cells = len(values[teacher])
     cuts = np.unique(np.clip((known[np.isfinite(known)] * cells).round().astype(int), 1, cells - 1))
     path = partition(np.arcsinh(filled(values[teacher])), number, floor, cuts)
     alone = Learner([values[teacher]], names, [False] * number)
-    taught, start = alone.run(alone.one_hot([path]), temper, FLOORS[1:3], steps=1)
-    if cuts.size:
-        learner.known[teacher] = path
+    taught, start = alone.run([np.eye(number)[path]], temper, FLOORS[1:3], steps=1)
+    paths = [path if cuts.size and i == teacher else None for i in range(len(values))]
+    learner = Learner(list(values), names, [False] * number, known=paths)
     aligned = learner.align(taught, learner.law(start))
-    emissions, probability = learner.run(
-        [a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)  # fmt: skip
+    emissions, probability = learner.run([a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
     paths = [p.argmax(1) for p in probability]
-    cost = merged_costs(values, paths, number, MERGE_FLOOR) / features
-    share = learner.independent_share(emissions, probability) * features
+    one_hot, stacked = np.eye(number)[np.concatenate(paths)], np.vstack([filled(v) for v in values])
+    x = np.arcsinh(stacked)
+    cost = pooled_costs(one_hot.sum(0), one_hot.T @ x, one_hot.T @ x**2, MERGE_FLOOR) / features
+    share = learner.tempered(emissions, probability).temper * features
     return Course(probability, ends, cost, share, seen(values, paths, number, share))
 
 
@@ -183,12 +181,6 @@ def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int,
     return out
 
 
-def _alike(one: Course, other: Course) -> bool:
-    if one.ends.shape != other.ends.shape:
-        return False
-    return bool(np.abs(one.ends - other.ends).max(initial=0.0) < SAME)
-
-
 def coarse(values: np.ndarray, factor: int) -> np.ndarray:
     """Means over `factor` neighbouring cells; a mean without a cell is NaN."""
     known = np.isfinite(values)
@@ -196,15 +188,6 @@ def coarse(values: np.ndarray, factor: int) -> np.ndarray:
     count = np.add.reduceat(known.astype(float), starts, axis=0)
     total = np.add.reduceat(np.where(known, values, 0.0), starts, axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def merged_costs(
-    values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, floor: float
-) -> np.ndarray:
-    """Cost [a, b] (number + 1, number + 1) of stretches a <= k < b as one state, pooled over trials."""
-    stacked = np.arcsinh(np.vstack([filled(v) for v in values]))
-    one_hot = np.eye(number)[np.concatenate(paths)]
-    return pooled_costs(one_hot.sum(0), one_hot.T @ stacked, one_hot.T @ stacked**2, floor)
 
 
 LEAST_SHARE = 1e-3  # numerics: of a trial, for a duration's logarithm
@@ -293,20 +276,15 @@ def naming(
     joint = np.array([one + other for one, other in zip(ahead, behind[::-1], strict=True)])[:, 1:number]
     total = float(np.logaddexp.reduce(joint[0]))
     last = np.exp(ahead[-1][:, None] + end - total)[:, 1:number].sum(0)
-    return Naming(total - _choices(change, num_states - 1), np.exp(joint - total), last)
+    choices = np.r_[0.0, np.full(num_states - 1, -np.inf)]  # log of their weights' sum, by number chosen
+    for each in change:
+        choices[1:] = np.logaddexp(choices[1:], choices[:-1] + each)
+    return Naming(total - float(choices[-1]), np.exp(joint - total), last)
 
 
 def _change_weights(course: Course, weighing: Weighing) -> np.ndarray:
     """Log weight (num_changes,) of each change as an end of a state: that it is seen, or is one unseen."""
     return np.logaddexp(np.log1p(-weighing.unseen) + course.seen, np.log(weighing.unseen))
-
-
-def _choices(weights: np.ndarray, count: int) -> float:
-    """Log of the sum over all choices of `count` changes of the product of their weights, given as logs."""
-    total = np.r_[0.0, np.full(count, -np.inf)]
-    for each in weights:
-        total[1:] = np.logaddexp(total[1:], total[:-1] + each)
-    return float(total[-1])
 
 
 def _weights(course: Course, weighing: Weighing) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -333,9 +311,7 @@ def label_weights(course: Course, labels: Sequence[np.ndarray], weighing: Weighi
 
 def probabilities(namings: Sequence[Naming]) -> np.ndarray:
     """Posterior probability (num_courses,) of each course."""
-    evidence = np.array([each.log_evidence for each in namings])
-    weights = np.exp(evidence - evidence.max())
-    return weights / weights.sum()
+    return softmax([each.log_evidence for each in namings])
 
 
 def best_choice(courses: Sequence[Course], namings: Sequence[Naming], probability: np.ndarray) -> Choice:
@@ -361,18 +337,13 @@ def best_choice(courses: Sequence[Course], namings: Sequence[Naming], probabilit
 
 def _increasing(right: np.ndarray) -> tuple[float, list[int]]:
     """Increasing columns (one a row) of `right` with the greatest sum, and that sum."""
-    rows, columns = right.shape
     total, source = right[0], []
-    for b in range(1, rows):
-        best = np.maximum.accumulate(total)
-        first = np.array([int(np.argmax(total[: j + 1])) for j in range(columns)])
-        source.append(np.r_[0, first[:-1]])
-        total = np.r_[-np.inf, best[:-1]] + right[b]
-    at = int(total.argmax())
-    cuts = [at]
+    for row in right[1:]:
+        source.append([0, *(int(total[:j].argmax()) for j in range(1, row.size))])
+        total = np.r_[-np.inf, np.maximum.accumulate(total)[:-1]] + row
+    cuts = [int(total.argmax())]
     for back in reversed(source):
-        at = int(back[at])
-        cuts.append(at)
+        cuts.append(back[cuts[-1]])
     return float(total.max()), cuts[::-1]
 
 

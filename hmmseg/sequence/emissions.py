@@ -1,4 +1,4 @@
-"""What states and boundaries of a plain ordered task look like, and how states follow each other.
+"""The model of a plain ordered task, and its EM: what states and boundaries look like, how states follow.
 
 States have independent Student t features, tempered for dependence: neighbouring cells and different
 channels repeat each other's evidence, and multiplying their likelihoods as if independent would make
@@ -18,15 +18,20 @@ disturb, and a wide one, so that the clock does not decide. States may be skippe
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import gammaln
 
 from hmmseg.hmm import Chain, left_to_right
+from hmmseg.hmm.inference import align
+from hmmseg.hmm.results import AlignmentPosterior
 
 DOF = 4.0  # cited: heavy tails: a transient moves neither location nor scale much
 ONE_CELL = 1e-9  # numerics: a state without even so much weight is left as it is
+FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM settles
+STEPS_PER_FLOOR = 4  # numerics: of EM
+LEAST_CELLS = 1.5  # numerics: least mean duration of a state
 
 
 @dataclass(frozen=True)
@@ -77,12 +82,6 @@ def from_weights(values: np.ndarray, weights: np.ndarray, floor: float, temper: 
     for _ in range(iterations):
         emissions = update(emissions, values, weights, floor)
     return emissions
-
-
-def residuals(emissions: StudentEmissions, values: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Standardised residuals (num_cells, num_features) along a path, heavy tails brought in."""
-    z = (values - emissions.loc[path]) / emissions.scale[path]
-    return np.arctan(np.nan_to_num(z))
 
 
 def independent_share(trials: Sequence[np.ndarray]) -> float:
@@ -188,7 +187,7 @@ def learn(trials: Sequence[np.ndarray], edges: Sequence[np.ndarray], half: int) 
 def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence[bool]) -> Chain:
     """The chain of mean durations [cells] and the probability that an optional state occurs."""
     there = np.where(np.asarray(optional, bool), np.clip(presence, 1e-12, 1 - 1e-12), 1.0)
-    return left_to_right(np.maximum(mean_cells, 1.5), there)
+    return left_to_right(np.maximum(mean_cells, LEAST_CELLS), there)
 
 
 def detecting(chain: Chain, crossing: np.ndarray) -> Chain:
@@ -203,3 +202,87 @@ def detecting(chain: Chain, crossing: np.ndarray) -> Chain:
     )
     ends = {"log_initial": chain.log_initial, "log_final": chain.log_final}
     return Chain(stay, advance, skips or None, **ends)
+
+
+@dataclass
+class Learner:
+    """EM over `values` [(num_cells, num_features), ...] of all trials.
+
+    `names` of the task's states and `optional` (num_states,) say what may follow what. What labels say of
+    each trial: `known`, its path (num_cells,), which then stays as it is; `allowed` (num_cells, num_states),
+    -inf where a state is forbidden and 0 elsewhere. None where they say nothing.
+    """
+
+    values: list[np.ndarray]
+    names: Sequence[str]
+    optional: Sequence[bool]
+    known: list[np.ndarray | None] = field(default_factory=list)
+    allowed: list[np.ndarray | None] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.known = self.known or [None] * len(self.values)
+        self.allowed = self.allowed or [None] * len(self.values)
+        self.num_states, self.stacked = len(self.optional), np.vstack(self.values)
+        # A name listed twice is one state that comes twice: its emissions are learned together.
+        ids = [*self.names, *range(self.num_states - len(self.names))]
+        self._same = np.array([[one == other for other in ids] for one in ids], dtype=float)
+
+    def law(self, probability: Sequence[np.ndarray]) -> Chain:
+        """How states follow each other, from posterior state probabilities."""
+        return transitions(*durations(probability), self.optional)
+
+    def emissions(self, probability: Sequence[np.ndarray], floor: float, temper: float) -> StudentEmissions:
+        """Emissions from posterior state probabilities alone."""
+        return from_weights(self.stacked, np.vstack(probability) @ self._same, floor, temper)
+
+    def align(self, emissions: StudentEmissions, law: Chain,
+              detectors: Detectors | None = None) -> list[AlignmentPosterior]:  # fmt: skip
+        """Alignments of all trials, in which no state is where labels forbid it."""
+        tables, chains = zip(
+            *(weighed(values, emissions, law, detectors) for values in self.values), strict=True
+        )
+        tables = [ll if free is None else ll + free for ll, free in zip(tables, self.allowed, strict=True)]
+        return align(tables, chains)
+
+    def run(self, probability: Sequence[np.ndarray], temper: float, floors: Sequence[float] = FLOORS,
+            detectors: Detectors | None = None, steps: int = STEPS_PER_FLOOR,
+            ) -> tuple[StudentEmissions, list[np.ndarray]]:  # fmt: skip
+        """EM from given state probabilities, `steps` at each floor of the scales; also those it ends with."""
+        emissions, law = self.emissions(probability, floors[0], temper), self.law(probability)
+        for floor in np.repeat(floors, steps):
+            probability = self.labelled([each.smoothed for each in self.align(emissions, law, detectors)])
+            emissions = update(emissions, self.stacked, np.vstack(probability) @ self._same, floor)
+            law = self.law(probability)
+        return emissions, list(probability)
+
+    def labelled(self, probability: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """State probabilities, of labelled trials those of their labels."""
+        return [p if k is None else np.eye(self.num_states)[k]
+                for p, k in zip(probability, self.known, strict=True)]  # fmt: skip
+
+    def tempered(self, emissions: StudentEmissions, probability: Sequence[np.ndarray]) -> StudentEmissions:
+        """Emissions with the share of independent observations in what they leave of the features."""
+        left = []
+        for values, path in zip(self.values, (p.argmax(1) for p in probability), strict=True):
+            z = (values - emissions.loc[path]) / emissions.scale[path]
+            left.append(np.arctan(np.nan_to_num(z)))  # heavy tails brought in
+        return replace(emissions, temper=independent_share(left))
+
+
+def weighed(values: np.ndarray, emissions: StudentEmissions, law: Chain,
+            detectors: Detectors | None) -> tuple[np.ndarray, Chain]:  # fmt: skip
+    """Log-likelihoods (num_cells, num_states) of a trial, and its chain."""
+    ll = emissions.log_likelihoods(values)
+    if detectors is None:
+        return ll, law
+    return detectors.state_weight * ll, detecting(law, detectors.crossing(values))
+
+
+def durations(probability: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean durations [cells] and presence (num_states,), from posterior state probabilities.
+
+    Presence has a Beta(1, 1) prior.
+    """
+    visited = np.array([p.max(0) for p in probability])
+    cells = np.sum([p.sum(0) for p in probability], 0) / np.maximum(visited.sum(0), 0.5)
+    return np.maximum(cells, LEAST_CELLS), (visited.sum(0) + 1) / (len(probability) + 2)

@@ -42,6 +42,15 @@ class SequenceFeatures:
     edges: np.ndarray
     values: np.ndarray
 
+    @property
+    def middle(self) -> np.ndarray:
+        """Middle (num_cells,) of each cell [s]."""
+        return (self.edges[1:] + self.edges[:-1]) / 2
+
+    def shares(self, boundaries: np.ndarray) -> np.ndarray:
+        """Times [s] as shares of the trial."""
+        return (boundaries - self.edges[0]) / (self.edges[-1] - self.edges[0])
+
 
 def without_old(values: np.ndarray) -> np.ndarray:
     """A channel (num_timesteps,) whose repeated readings are missing (NaN), where it is read at a lower rate.

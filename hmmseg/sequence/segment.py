@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.special import entr
 
 from hmmseg.errors import InputError
 from hmmseg.hmm.chain import InfeasibleAlignment
@@ -22,8 +23,8 @@ from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Failure, Place, Question, Segmentation, Span
 from hmmseg.sequence.courses import NEAR, WEIGHING
 from hmmseg.sequence.features import SequenceFeatures, features
-from hmmseg.sequence.fit import boundary_probabilities, fit_sequence
-from hmmseg.sequence.model import NamedCourse, SequenceModel, find_failure, optional_states
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states
 
 LISTED = 0.05  # chosen: least probability of a place that is listed
 SURE = 1 - LISTED  # from here on one place is the answer: no other can be listed
@@ -60,28 +61,15 @@ def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], la
                     moved = shift(moved, course.shift[b, j], order=1)
                 parts.append(moved)
                 weights.append(weight[j])
-        table = _normal(convolve1d(np.array(parts), _laplace(scale), axis=1, mode="constant"))
+        reach = int(np.ceil(FARTHEST * scale))
+        law = np.exp(-np.abs(np.arange(-reach, reach + 1)) / max(scale, 1e-9))
+        table = convolve1d(np.array(parts), law / law.sum(), axis=1, mode="constant")
+        table /= np.maximum(table.sum(1, keepdims=True), np.finfo(float).tiny)
         p = np.array(weights) / np.sum(weights)
         mixed = p @ table
-        gain.append(max(_entropy(mixed) - float(p @ [_entropy(part) for part in table]), 0.0))
+        gain.append(max(float(entr(mixed).sum() - p @ entr(table).sum(1)), 0.0))
         mixture.append((1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / len(mixed))
     return Boundaries(np.array(mixture).T, np.array(gain))
-
-
-def _laplace(scale: float) -> np.ndarray:
-    reach = int(np.ceil(FARTHEST * scale))
-    kernel = np.exp(-np.abs(np.arange(-reach, reach + 1)) / max(scale, 1e-9))
-    return kernel / kernel.sum()
-
-
-def _normal(table: np.ndarray) -> np.ndarray:
-    return table / np.maximum(table.sum(1, keepdims=True), np.finfo(float).tiny)
-
-
-def near(edges: np.ndarray, crossing: np.ndarray, time: float) -> float:
-    """Probability within NEAR of `time` of a boundary: `crossing` (num_cells - 1,) at the inner `edges`."""
-    here = np.abs(edges[1:-1] - time) <= NEAR * (edges[-1] - edges[0])
-    return float(crossing[here].sum() / crossing.sum())
 
 
 def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
@@ -110,10 +98,6 @@ def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Plac
     if found[0].probability >= SURE or len(found) == 1:
         return ()
     return tuple(place for place in found if place.probability >= LISTED)
-
-
-def _entropy(p: np.ndarray) -> float:
-    return float(-(p * np.log(np.where(p > 0, p, 1.0))).sum())
 
 
 MAIN = 0.5  # chosen: least probability about a median for it to be the answer, not a time amid several places
@@ -149,7 +133,7 @@ def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
 def _segment(trial: Trial, data: SequenceFeatures, model: SequenceModel) -> Segmentation:
     names = model.task.sequence
     try:
-        alignment = model.align([data])[0]
+        alignment = model.align(data)
         known = _posterior(data, model, alignment)
     except InfeasibleAlignment as error:
         k = min(error.subtask, len(names) - 1)
@@ -159,52 +143,43 @@ def _segment(trial: Trial, data: SequenceFeatures, model: SequenceModel) -> Segm
     question = None
     if any(span.alternatives for span in spans):
         question = Question(trial.file, names[int(known.gain.argmax()) + 1], float(known.gain.max()))
-    return Segmentation(trial.file, trial.rate, alignment.log_evidence, spans,
-                        _failure(data, model), recorded=trial, question=question)  # fmt: skip
+    return Segmentation(trial.file, trial.rate, alignment.log_evidence, spans, model.failure(data),
+                        recorded=trial, question=question)  # fmt: skip
 
 
 def _posterior(data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior) -> Boundaries:
     """Of all boundaries: from the model itself where labels taught it, else from all its courses."""
-    if not model.courses:
-        crossing = boundary_probabilities(alignment)[:, : len(model.task.sequence) - 1].copy()
-        if model.detectors is not None:
-            for b, jitter in enumerate(model.detectors.jitter):
-                if jitter > 0:
-                    crossing[:, b] = gaussian_filter1d(crossing[:, b], jitter, mode="constant")
-        return Boundaries(crossing, np.zeros(crossing.shape[1]))
-    return together([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
-
-
-def _failure(data: SequenceFeatures, model: SequenceModel) -> Failure | None:
-    plain = model.without_templates(data)
-    return find_failure(
-        model.task.sequence, optional_states(model.task, False), model.typical, model.usual_scores,
-        plain.emissions.log_likelihoods(data.values), model.mean_cells, plain.align([data])[0],
-    )  # fmt: skip
+    if model.courses:
+        return together([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
+    crossing = alignment.boundary[:, : len(model.task.sequence) - 1].copy()
+    if model.detectors is not None:
+        for b in np.flatnonzero(model.detectors.jitter > 0):
+            crossing[:, b] = gaussian_filter1d(crossing[:, b], model.detectors.jitter[b], mode="constant")
+    return Boundaries(crossing, np.zeros(crossing.shape[1]))
 
 
 def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior,
            known: Boundaries) -> tuple[Span, ...]:  # fmt: skip
     """Spans where the model itself has them, as uncertain as all courses together."""
-    names = model.task.sequence
-    visited = _visit_probabilities(alignment)[: len(names)]
-    optional = optional_states(model.task, False)
+    names, optional = model.task.sequence, optional_states(model.task, False)
+    visited = alignment.smoothed[0].copy()  # probability that a path starts in or enters each state
+    for d, band in enumerate(alignment.moves, 1):
+        visited[d:] += band.sum(0)
     kept = [k for k in range(len(names)) if not optional[k] or visited[k] >= 0.5]
     first, last, step = float(trial.t[0]), float(trial.t[-1]), float(data.edges[1] - data.edges[0])
-    own = boundary_probabilities(alignment)
-    found = []
+    found, dated = [], []
     for k in kept[1:]:
-        median, sd, interval = _boundary(
-            data.edges, known.crossing[:, k - 1], first, last, scattered=bool(model.courses)
-        )
-        if model.courses and near(data.edges, known.crossing[:, k - 1], median) < MAIN:
-            median = _boundary(data.edges, own[:, k - 1], first, last)[0]
-        found.append((median, sd, interval))
-    starts: list[_Boundary] = [(first, 0.0, (first, first))]
-    elsewhere: list[tuple[Place, ...]] = [()]
-    dated = [each[0] for each in found]
+        crossing, scattered = known.crossing[:, k - 1], bool(model.courses)
+        found.append(_boundary(data.edges, crossing, first, last, scattered))
+        dated.append(found[-1][0])
+        if scattered:
+            here = np.abs(data.edges[1:-1] - dated[-1]) <= NEAR * (data.edges[-1] - data.edges[0])
+            if crossing[here].sum() / crossing.sum() < MAIN:
+                dated[-1] = _boundary(data.edges, alignment.boundary[:, k - 1], first, last)[0]
     if model.courses and not any(course.shift[k - 1].any() for course in model.courses for k in kept[1:]):
         dated = _jumps(trial, data, model, dated)
+    starts: list[_Boundary] = [(first, 0.0, (first, first))]
+    elsewhere: list[tuple[Place, ...]] = [()]
     for number, (k, median, (_, sd, (low, high))) in enumerate(zip(kept[1:], dated, found, strict=True), 1):
         # A state that is there lasts a cell at least, as in every alignment: medians of places need not.
         median = max(starts[-1][0] + step, min(median, last - step * (len(kept) - number)))
@@ -306,14 +281,6 @@ def _jump(trial: Trial, model: SequenceModel, before: float, time: float, after:
     return float(between[open_][np.searchsorted(weight, weight[-1] / 2)])
 
 
-def _visit_probabilities(alignment: AlignmentPosterior) -> np.ndarray:
-    """Probability (num_states,) that a path enters or starts in each state."""
-    visited = alignment.smoothed[0].copy()
-    for d, band in enumerate(alignment.moves, 1):
-        visited[d:] += band.sum(0)
-    return visited
-
-
 def _boundary(
     edges: np.ndarray, probability: np.ndarray, first: float, last: float, scattered: bool = False
 ) -> _Boundary:
@@ -324,18 +291,16 @@ def _boundary(
     at the very start) lies at the first edge. `scattered`: it may lie in places far apart, between which
     there is nothing; the interval is then the shortest instead of that of equal tails.
     """
-    step = edges[1] - edges[0]
-    middle = (edges[1:] + edges[:-1]) / 2
-    cumulative = np.concatenate([[0.0], np.cumsum(probability)])
+    middle, inner = (edges[1:] + edges[:-1]) / 2, edges[1:-1]
+    cumulative = np.r_[0.0, np.cumsum(probability)]
     total = max(cumulative[-1], np.finfo(float).tiny)
     low, median, high = np.interp([0.05, 0.5, 0.95], cumulative / total, middle)
     if scattered:
         low, high = _shortest(middle, cumulative / total)
-    inner = edges[1:-1]
-    mean = (probability * inner).sum() / total
-    variance = (probability * (inner - mean) ** 2).sum() / total + step**2 / 12
-    clip = lambda t: float(np.clip(t, first, last))  # noqa: E731
-    return clip(median), float(np.sqrt(variance)), (clip(low), clip(high))
+    mean = probability @ inner / total
+    variance = probability @ (inner - mean) ** 2 / total + (edges[1] - edges[0]) ** 2 / 12
+    low, median, high = np.clip([low, median, high], first, last).tolist()
+    return median, float(np.sqrt(variance)), (low, high)
 
 
 def _shortest(middle: np.ndarray, cumulative: np.ndarray) -> tuple[float, float]:

@@ -23,7 +23,6 @@ from simgap.attribution.problem import Gap, Rows
 from simgap.attribution.search import Detection, detected, leniently, sought, statistic, weights
 from simgap.attribution.verdict import (
     ALARM,
-    LEAST,
     RULED_OUT,
     Cell,
     Explanation,
@@ -184,20 +183,14 @@ def attribute(
     w = weights(models)
     noise = noise_of(f, models[0])
     by_group = (noise**2)[channel_of(f)]
-    # A set's probability to be the cause, what has no name being what no name explains.
-    parts = _by_name(f, models, by_group, rng)
-    likely: dict[tuple[int, ...], float] = {}
-    for m, weight in zip(models, w, strict=True):
-        likely[parts[m.effects]] = likely.get(parts[m.effects], 0.0) + float(weight)
-    ranked = sorted((p for p in likely if p), key=lambda p: -likely[p])
-    ranked, others = ranked[:EXAMINED], None
+    ranked, others = [m.effects for m in models if m.effects][:EXAMINED], None
     if heldout and (found.p_value < ALARM or forced):
-        others = Heldout.of(gap, noise**2, (j for part in ranked for j in part))
-    examined = {part: _examined(f, part, models, by_group, rng, others) for part in ranked}
-    sets = [_explanation(f, parts[m.effects], float(x), examined) for m, x in zip(models, w, strict=True)]
+        others = Heldout.of(gap, noise**2, (j for effects in ranked for j in effects))
+    examined = {effects: _examined(f, effects, models, by_group, rng, others) for effects in ranked}
+    sets = [_explanation(f, m.effects, float(x), examined) for m, x in zip(models, w, strict=True)]
     small = None
     if gap.tolerance is not None and (found.p_value < ALARM or forced):
-        small = _small(f, models, parts, by_group, absorbed)
+        small = _small(f, models, by_group, absorbed)
     if small is not None and gap.usual:  # a cause that is surely found can be mended
         chance = conclude(sets, found.p_value).probabilities
         small = small if chance["none"] + chance["unknown"] > DOUBT else None
@@ -239,55 +232,32 @@ def _names(f: Forms, effects: Iterable[int]) -> tuple[str, ...]:
 
 
 def _explanation(
-    f: Forms, part: tuple[int, ...], weight: float, examined: dict[tuple[int, ...], _Examined]
+    f: Forms, effects: tuple[int, ...], weight: float, examined: dict[tuple[int, ...], _Examined]
 ) -> Explanation:
-    one = examined.get(part)
+    one = examined.get(effects)
     if one is None:
-        return Explanation(_names(f, part), weight)
-    return Explanation(_names(f, part), weight, _names(f, one.causes), one.known)
+        return Explanation(_names(f, effects), weight)
+    return Explanation(_names(f, effects), weight, _names(f, one.causes), one.known)
 
 
 def _small(
-    f: Forms, models: list[Model], parts: dict[tuple[int, ...], tuple[int, ...]], by_group: np.ndarray,
-    absorbed: np.ndarray | None,
-) -> SmallGap | None:  # fmt: skip
+    f: Forms, models: list[Model], by_group: np.ndarray, absorbed: np.ndarray | None
+) -> SmallGap | None:
     """The gap's size where neither residuals, nor what is likely, nor the properties it moves matter."""
     assert f.gap.tolerance is not None
     small = small_gap(f, np.minimum(by_group, 1.0), f.gap.tolerance)
     if small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM:
         return None
-    if absorbed is not None:  # by causes that have a name: what has none says nothing of properties
-        model = fitted(f, parts[models[0].effects])
-        moved = np.abs(model.x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
+    if absorbed is not None:
+        moved = np.abs(models[0].x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
         if (moved > absorbed).any():
             return None
     return small
 
 
-def _by_name(
-    f: Forms, models: list[Model], by_group: np.ndarray, rng: np.random.Generator
-) -> dict[tuple[int, ...], tuple[int, ...]]:
-    """The effects of each set that have a name.
-
-    What has none explains a gap only where names do not: a set with it counts as the likeliest set of names
-    alone where that explains as much but for LEAST of the gap.
-    """
-    parts = {m.effects: tuple(j for j in m.effects if f.gap.candidates[j].named) for m in models}
-    nameless = [m for m in models if len(parts[m.effects]) < len(m.effects)]
-    if not nameless:
-        return parts
-    best = next((m for m in sought(f, 1, named=True) if m.effects), None)
-    if best is not None:
-        names = shares(f, best, by_group, rng)
-        for m in nameless:
-            if names.after - shares(f, m, by_group, rng).after < LEAST * (names.before - names.floor):
-                parts[m.effects] = best.effects
-    return parts
-
-
 def _forced(f: Forms, names: tuple[str, ...]) -> Model:
     """The best set of these effects, one form of each; InputError for one that cannot act here."""
-    possible = dict.fromkeys(c.name for c in f.gap.candidates if c.named)
+    possible = dict.fromkeys(c.name for c in f.gap.candidates)
     for name in names:
         if name not in possible:
             raise InputError(f"effect {name!r}", "cannot act on these recordings", ", ".join(possible))

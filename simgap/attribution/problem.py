@@ -60,7 +60,7 @@ class Candidate:
     Cauchy distribution of that scale, so that gross faults stay possible (Gelman et al., Ann. Appl. Stat. 2,
     2008). `shift` (n,): by how much the effect at `at` shifts the residual, `jacobian` (n, k) its derivatives
     there. `variance` (n,) is what it adds to each row's variance instead, at `at`; `evidence` [nats] what
-    else speaks for it. What is not `named` fits anything, and may only win the verdict "unknown". `form`: by
+    else speaks for it. `form`: by
     which share the effect's own form is usually off from one part of a recording to another. `hidden`:
     parameters that may be others in every part, as phases of an oscillation are. `size` (k,): what a share of
     a parameter is a share of; its deviation from neutral where that is not given, or not finite.
@@ -79,7 +79,6 @@ class Candidate:
     high: Float[np.ndarray, " k"]
     variance: Float[np.ndarray, " n"] | None = None
     evidence: float = 0.0
-    named: bool = True
     form: float = 0.1
     hidden: tuple[str, ...] = ()
     size: Float[np.ndarray, " k"] | None = None
@@ -89,7 +88,7 @@ class Candidate:
         """The candidate on some rows."""
         variance = None if self.variance is None else self.variance[rows]
         return Candidate(self.name, self.parameters, self.at, self.neutral, self.scale, self.shift[rows],
-                         self.jacobian[rows], self.low, self.high, variance, self.evidence, self.named,
+                         self.jacobian[rows], self.low, self.high, variance, self.evidence,
                          self.form, self.hidden, self.size,
                          None if self.frees is None else self.frees[rows])  # fmt: skip
 

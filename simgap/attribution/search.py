@@ -27,18 +27,14 @@ BEAM = 5  # numerics: sets of each size that are extended
 MOST = 6  # numerics: effects of a set at most
 
 
-def sought(
-    f: Forms, beam: int = BEAM, named: bool = False, among: Sequence[int] | None = None
-) -> list[Model]:
+def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> list[Model]:
     """All sets found within the window of the best, best first; the empty set is always one.
 
     Neighbours of a set are screened from its mode in one step, leading ones in a few; what leads then is
     fitted to the end.
-    `beam`: how many sets of the window are extended. `named`: of candidates that have a name alone.
-    `among`: of these candidates alone.
+    `beam`: how many sets of the window are extended. `among`: of these candidates alone.
     """
-    every = range(len(f.gap.candidates)) if among is None else among
-    among = [j for j in every if f.gap.candidates[j].named or not named]
+    among = list(range(len(f.gap.candidates)) if among is None else among)
     seen: dict[tuple[int, ...], Model] = {(): fitted(f, ()), **{(j,): fitted(f, (j,)) for j in among}}
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}
@@ -136,7 +132,12 @@ def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
 
 def clear(value: float, most: float) -> bool:
     """Whether a statistic is that of a gap for certain, were a healthy one twice the `most` that was seen."""
-    return value - 2 * max(0.0, most) > -np.log(SURE)
+    return max(0.0, most) < doubtful(value)
+
+
+def doubtful(value: float) -> float:
+    """The least statistic [nats] of a healthy recording that leaves a gap's `value` in doubt."""
+    return (value + float(np.log(SURE))) / 2
 
 
 def detected(value: float, twins: Iterable[float] | None = None) -> Detection:

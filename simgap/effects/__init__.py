@@ -1,7 +1,4 @@
-"""The candidate effects: every `Effect` that a module of this package defines is one, found by itself.
-
-Those of `unnamed` are outside the contract: where one explains a recording best the verdict is "unknown".
-"""
+"""The candidate effects: every `Effect` that a module of this package defines is one, found by itself."""
 
 from __future__ import annotations
 
@@ -15,29 +12,14 @@ from simgap.effects.base import HandEffect, of_forces
 
 
 @cache
-def _defined(decoy: bool) -> dict[str, HandEffect]:
-    modules = [m for m in pkgutil.iter_modules(__path__) if (m.name == "unnamed") == decoy]
-    found = [vars(importlib.import_module(f"{__name__}.{m.name}")).values() for m in modules]
-    effects = {e.name: e for each in found for e in each if isinstance(e, HandEffect)}
-    if not decoy:  # those on any channel, but where hands have forms of their own
-        on_forces = (of_forces(channel) for channel in channel_effects().values())
-        effects = {e.name: e for e in on_forces if e.correct or e.name in effects} | effects
-    return dict(sorted(effects.items()))
-
-
 def catalogue() -> dict[str, HandEffect]:
     """All effects by name, in alphabetical order."""
-    return _defined(decoy=False)
-
-
-def decoys() -> dict[str, HandEffect]:
-    """Decoys: effects fitted as alternatives to the catalogue's, and never named."""
-    return _defined(decoy=True)
-
-
-def fitted() -> dict[str, HandEffect]:
-    """The catalogue's effects and the decoys."""
-    return catalogue() | decoys()
+    modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
+    effects = {e.name: e for each in modules for e in vars(each).values() if isinstance(e, HandEffect)}
+    # Those on any channel, but where hands have forms of their own.
+    on_forces = (of_forces(channel) for channel in channel_effects().values())
+    effects = {e.name: e for e in on_forces if e.correct or e.name in effects} | effects
+    return dict(sorted(effects.items()))
 
 
 def effect_named(name: str) -> HandEffect:
@@ -55,10 +37,10 @@ def name_of(key: str) -> str:
 
 def free_parameters(key: str) -> tuple[str, ...]:
     """Parameters that are free in a form of an effect."""
-    effect, _, form = fitted()[name_of(key)], *key.partition("/")[1:]
+    effect, _, form = catalogue()[name_of(key)], *key.partition("/")[1:]
     return effect.forms[int(form or 0)] if effect.forms else tuple(effect.parameters)
 
 
 def forms_of(name: str) -> list[str]:
     """Keys of all forms of an effect."""
-    return [name, *(f"{name}/{k}" for k in range(1, len(fitted()[name].forms)))]
+    return [name, *(f"{name}/{k}" for k in range(1, len(catalogue()[name].forms)))]

@@ -15,11 +15,10 @@ from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
 # A hand that is not as its drawing says: angles read with offsets, links longer than nominal, all alike or
-# each by its own, the second finger's base off its place.
+# each by its own.
 
 JOINTS = ("q11", "q12", "q21", "q22")
 LINKS = ("link11", "link12", "link21", "link22")
-BASE = ("base_x", "base_y")
 
 
 def _numbers(values, names, common: str = "") -> np.ndarray:
@@ -31,7 +30,6 @@ def correct_hand(world: World, values, on) -> World:
     return world._replace(
         joints=world.joints - _numbers(values, JOINTS) * world.jointed,
         link=world.link * (1 + _numbers(values, LINKS, "scale")),
-        base=world.base + np.concatenate([np.zeros(2), _numbers(values, BASE)]),
     )
 
 
@@ -45,12 +43,11 @@ def moved_joints(p: Performance, values, change) -> Performance:
     if not p.rig.jointed:
         raise ValueError("a Cartesian hand has no joints")
     longer = _numbers(values, LINKS, "scale").reshape(2, 2)
-    shift = np.array([[0.0, 0.0], _numbers(values, BASE)])
     q, dq = [], []
     for i in (1, 2):
         nominal = p.rig.finger(i)
         true = nominal.model_copy(update={"links": tuple(nominal.links * (1 + longer[i - 1]))})
-        q.append(inverse(true, i, p.position[:, i - 1] - shift[i - 1]))
+        q.append(inverse(true, i, p.position[:, i - 1]))
         dq.append(joint_velocity(true, q[-1], p.velocity[:, i - 1]))
     read = np.split(change(np.concatenate(q, 1)), 2, axis=1)
     fingers = [p.rig.finger(i) for i in (1, 2)]

@@ -14,13 +14,14 @@ from hmmseg.io.rig import Tolerance
 from simgap.attribution.heldout import POSITIVE
 from simgap.attribution.posterior import STATED
 from simgap.attribution.problem import BANDS, Candidate, Gap, Rows, cosines
-from simgap.effects import catalogue, decoys, fitted, name_of
+from simgap.effects import catalogue, name_of
 from simgap.gap.frame import CHANNELS
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import (
     Fitted,
     Problem,
     columns_of,
+    cost_at,
     evaluated,
     free_of,
     limits,
@@ -83,7 +84,7 @@ def on_grid(
 def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Scatter]:
     """What each of the named effects that scatter adds to residuals (n,); not those that say nothing."""
     scattering: list[Callable] = [
-        e.scatter for n, e in fitted().items() if n in names and e.scatter is not None
+        e.scatter for n, e in catalogue().items() if n in names and e.scatter is not None
     ]
     found = [scatter(given, residual) for scatter in scattering]
     return [s for s in found if s is not None]
@@ -230,7 +231,8 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
 def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitted:
     """A fit's residual and derivatives at the same coordinates on another recording; `usual`: those by the
     properties, where they are known."""
-    now = evaluated(other, f.effects, f.u, f.columns, [], usual)
+    at = cost_at(other, f.effects, f.u, f.columns, [])
+    now = evaluated(other, f.effects, f.u, f.columns, at, usual)
     return replace(f, residual=now.residual, push=now.push)
 
 
@@ -388,13 +390,13 @@ def _candidate(
     doubts: float,
 ) -> Candidate:
     """One form of an effect at coordinates u, of which it has the columns `own`."""
-    free, effect = free_of(key), fitted()[name_of(key)]
+    free, effect = free_of(key), catalogue()[name_of(key)]
     low, high = (edge[own] for edge in limits(given))
     turned = sum(float(p.value(u[c])) for p, c in zip(free, own, strict=True) if p.name == effect.turns)
     return Candidate(
         effect.name, tuple(p.name for p in free), u[own], neutral(given)[own], np.ones(own.size), shift,
         -push,
-        low, high, evidence=-doubts, named=effect.name not in decoys(),
+        low, high, evidence=-doubts,
         hidden=tuple(p.name for p in free if p.hidden or p.shape),
         size=np.array([1 / p.sd if p.log else np.nan for p in free]),
         frees=_turning(given, turned) if effect.turns else None,

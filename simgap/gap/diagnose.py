@@ -18,7 +18,7 @@ from simgap.attribution.posterior import Model, forms
 from simgap.attribution.problem import Gap
 from simgap.attribution.search import sought
 from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
-from simgap.effects import catalogue, effect_named, fitted, free_parameters, name_of
+from simgap.effects import catalogue, effect_named, free_parameters, name_of
 from simgap.effects.base import World, tips
 from simgap.gap.assemble import scatters, together
 from simgap.gap.experiments import next_experiment
@@ -101,7 +101,8 @@ def shifts(given: Problem, causes: Fitted) -> np.ndarray:
     frame, u = given.frame, causes.u
     change = np.abs(channels(frame.world) - channels(world_without(given, causes.effects, u)))
     there = given.whitening.weight > 0
-    mechanical = [e for e in causes.effects if fitted()[name_of(e)].acts_on not in ("sensing", "kinematics")]
+    read = ("sensing", "kinematics")
+    mechanical = [e for e in causes.effects if catalogue()[name_of(e)].acts_on not in read]
     violated = np.zeros_like(change)
     if mechanical:
         rest = [e for e in causes.effects if e not in mechanical]
@@ -381,7 +382,7 @@ def attributed(
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
     models: list[Model] | None = sought(forms(gap))
-    leading = [j for j in models[0].effects if gap.candidates[j].named and j < len(found.fits)]
+    leading = [j for j in models[0].effects if j < len(found.fits)]
     if leading and not forced:
         joint = _together(found, leading)
         left = scatters(

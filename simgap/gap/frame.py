@@ -18,7 +18,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
 from hmmseg.robust import bridged
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
-from simgap.effects import catalogue, fitted, forms_of, free_parameters
+from simgap.effects import catalogue, forms_of, free_parameters
 from simgap.effects.base import World
 from simgap.gap.sensor_noise import (
     between_samples,
@@ -72,7 +72,7 @@ def shown(names: Sequence[str]) -> list[str]:
     Offsets, drift, drag and the tool's own mass are not among them: free motion takes them out
     (`hmmseg.hand.tool`).
     """
-    return [n for n in names if fitted()[n].wrist]
+    return [n for n in names if catalogue()[n].wrist]
 
 
 def shown_forms(names: Sequence[str]) -> list[str]:
@@ -105,7 +105,7 @@ def as_from_wrist(trial: Trial, like: Trial) -> Trial:
 # One aligned trial as arrays over its samples: signals, states, noise, and which equations hold where.
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
-OFFSET, NET, FORCES = 3, slice(6, 8), slice(6, 10)  # physics: places among CHANNELS
+OFFSET, NET, FORCES, GRIP_FORCE = 3, slice(6, 8), slice(6, 10), 8  # physics: places among CHANNELS
 BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
 LOST = 0.05  # chosen: share of the grip on either side below which all forces of a sample are nothing
 MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
@@ -210,6 +210,7 @@ def trial_arrays(
     there[np.ix_(_struck(force, sample["force"]), np.isin(CHANNELS, ("vx", "vy")))] = 0.0
     lone = _one_finger(t, force, subtask, free, boundaries, sample["force"])
     there[lone, FORCES] = 0.0
+    there[_opening(signals, force, subtask, free, rig), GRIP_FORCE] = 0.0
     carried = np.array([phase_of(s) == Phase.CARRY for s in steps])
     lifts = carried[1:] != carried[:-1]  # a block leaves its support or meets one
     either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
@@ -267,17 +268,33 @@ def _one_finger(
 ) -> np.ndarray:
     """Samples (N,) of free motion next to a grip at which one finger touches already or still.
 
-    Such a touch is a contact that the task does not list and no gap. One finger presses inwards, compared
-    with its own median in that free motion, and the other does not; `sd` (N,) is a force's noise [N].
+    Such a touch, of the block or of what stands below it, is a contact that the task does not list and no
+    gap. One finger's force is off its own median in that free motion, the other's is not; `sd` (N,) is a
+    force's noise [N].
     """
     out = np.zeros(t.size, bool)
     for s in np.unique(subtask[free]):
         mine = np.flatnonzero(subtask == s)
         change = force[mine] - np.median(force[mine], axis=0)
-        inwards = np.stack([change[:, 0], -change[:, 2]], 1) > SURE * sd[mine, None]
-        quiet = np.abs(change.reshape(-1, 2, 2)).max(axis=2) < SURE * sd[mine, None]
+        touches = np.abs(change.reshape(-1, 2, 2)).max(axis=2) > SURE * sd[mine, None]
         near = (np.abs(t[mine, None] - boundaries) < FIRST_TOUCH).any(axis=1)
-        out[mine] = near & ((inwards[:, 0] & quiet[:, 1]) | (inwards[:, 1] & quiet[:, 0]))
+        out[mine] = near & (touches[:, 0] != touches[:, 1])
+    return out
+
+
+def _opening(
+    signals: Signals, force: np.ndarray, subtask: np.ndarray, free: np.ndarray, rig: Rig
+) -> np.ndarray:
+    """Samples (N,) right after a grip at which fingers are not yet as far apart as pads without load are.
+
+    Pads come back late: fingers that open lose the block while they are still nearer than it is wide.
+    """
+    out, pad = np.zeros(free.size, bool), rig.fingertip
+    distance = signals.x2 - signals.x1
+    unloaded = distance + (force[:, 0] - force[:, 2]) / pad.normal_stiffness
+    for start in np.flatnonzero(free[1:] & ~free[:-1]) + 1:
+        nearer = distance[start:] < np.nanmedian(unloaded[subtask == subtask[start - 1]])
+        out[start : start + int(np.argmin(np.append(nearer & free[start:], False)))] = True
     return out
 
 
@@ -337,9 +354,9 @@ class Arrays(NamedTuple):
     is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `pushed` (T, N) [m]:
     how far the fingers are seen to go from sample to sample; `kind` (T, N):
     2 * phase, + 1 next to a contact change; `subtask` (T, N);
-    `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
-    `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
-    forces as they are in `World`.
+    `onehot` (T, N, M): nearest move; `new` (T, N, 3): first samples with another constant of x, y, offset;
+    `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot; `sample` (T, N, C): noise of one sample of a channel
+    itself; `sensor` (T, N, 3): that of angles, rates and forces as they are in `World`.
     """
 
     there: np.ndarray
@@ -349,6 +366,7 @@ class Arrays(NamedTuple):
     kind: np.ndarray
     subtask: np.ndarray
     onehot: np.ndarray
+    new: np.ndarray
     objects: np.ndarray
     rises: np.ndarray
     phase: np.ndarray
@@ -402,7 +420,8 @@ def build(aligned: AlignedTrials) -> Frame:
     for m, rise in height_equations(task):
         for name, value in rise.items():
             rises[m, task.objects.index(name)] = value
-    onehot = np.eye(moves)[stack["move"].astype(int)]
+    move, place = stack["move"].astype(int), stack["phase"][..., Phase.PLACE].astype(int)
+    grip, part = _others(move), _others(2 * move + place)
     arrays = Arrays(
         stack["there"],
         stack["sd"],
@@ -410,7 +429,8 @@ def build(aligned: AlignedTrials) -> Frame:
         stack["pushed"],
         stack["kind"].astype(int),
         stack["subtask"].astype(int),
-        onehot,
+        np.eye(moves)[move],
+        np.stack([part, grip, grip], -1),
         objects,
         rises,
         stack["phase"],
@@ -429,6 +449,11 @@ def build(aligned: AlignedTrials) -> Frame:
         tuple(np.stack([t.channels[c] for c in FORCE_CHANNELS], 1) for t in trials),
         tuple(group_size(t.rate, MAX_RATE) for t in trials),
     )
+
+
+def _others(number: np.ndarray) -> np.ndarray:
+    """Samples (T, N) with another number than the one before."""
+    return np.diff(number, axis=1, prepend=-1) != 0
 
 
 def _stacked(rows: list[np.ndarray], length: int) -> np.ndarray:

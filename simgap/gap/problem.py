@@ -13,8 +13,7 @@ from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
 from hmmseg.contact.decompose import PROPERTIES
 from simgap.bounded import least
 from simgap.effect import Parameter
-from simgap.effects import fitted as known_effects
-from simgap.effects import free_parameters, name_of
+from simgap.effects import catalogue, free_parameters, name_of
 from simgap.effects.base import HandEffect, World
 from simgap.gap.frame import CHANNELS, Frame
 from simgap.gap.residuals import contact, residuals
@@ -84,7 +83,7 @@ class Slot:
 def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
     """Slots of all deterministic effects in order of correction, and the number of columns."""
     out, at = [], num_properties
-    known = [e for e in known_effects().values() if e.correct is not None]
+    known = [e for e in catalogue().values() if e.correct is not None]
     for effect in sorted(known, key=lambda e: (e.stage, e.name)):
         out.append(Slot(effect, at))
         at += len(effect.parameters)
@@ -170,7 +169,7 @@ def _bare(frame: Frame, centre: np.ndarray, sd: np.ndarray, measured: np.ndarray
 
 def free_of(key: str) -> list[Parameter]:
     """The free parameters of an effect's form, in the order of its columns."""
-    return [p for p in known_effects()[name_of(key)].parameters.values() if p.name in free_parameters(key)]
+    return [p for p in catalogue()[name_of(key)].parameters.values() if p.name in free_parameters(key)]
 
 
 def neutral(given: Problem) -> np.ndarray:
@@ -303,39 +302,46 @@ class Evaluated(NamedTuple):
     cost: float
 
 
+def cost_at(
+    given: Problem, effects: tuple[str, ...], u: np.ndarray, mine: np.ndarray, blocks: list[np.ndarray]
+) -> tuple[np.ndarray, float, float]:
+    """What a candidate leaves (n,) at coordinates u, the cost of doubts [nats], and the cost in all."""
+    left, doubts = whitened(given, _without_effects(given, effects, u), given.properties(u))
+    left, own = left.ravel()[given.existing], u[mine[: given.num_properties]]
+    cost = 0.5 * float(given.product(left, left)) + doubts + 0.5 * float(own @ own)
+    for block in blocks:
+        x = u[mine[block]]
+        cost += 0.5 * (1 + block.size) * float(np.log1p(x @ x))
+    return left, doubts, cost
+
+
 def evaluated(
     given: Problem,
     effects: tuple[str, ...],
     u: np.ndarray,
     mine: np.ndarray,
-    blocks: list[np.ndarray],
+    at: tuple[np.ndarray, float, float],
     usual: np.ndarray | None = None,
 ) -> Evaluated:
-    """What a candidate leaves at coordinates u, and its derivatives by the columns `mine`.
+    """What a candidate leaves at coordinates u, as `cost_at` has it, and its derivatives by columns `mine`.
 
     They are differences over a small step: in double precision good to STEP of a usual deviation. `usual`
     (n, P): those by the properties, which an effect hardly changes, where they are known already.
     """
-    k, step = given.num_properties, u.copy()
-    world, properties = _without_effects(given, effects, u), given.properties(u)
-    each = [whitened(given, world, properties)]
+    k, step, properties, each = given.num_properties, u.copy(), given.properties(u), []
     if usual is None:  # a property alone needs no effect taken out once more
+        world = _without_effects(given, effects, u)
         each += [whitened(given, world, row) for row in given.properties(u + STEP * np.eye(k, u.size))]
     for column in mine[k:]:
         step[column] += STEP
         each.append(whitened(given, _without_effects(given, effects, step), properties))
         step[column] = u[column]
-    z = np.stack([residual.ravel()[given.existing] for residual, _ in each])
-    doubts = np.array([doubt for _, doubt in each])
-    push, lift = (z[1:] - z[0]).T / STEP, (doubts[1:] - doubts[0]) / STEP
+    z = np.array([residual.ravel()[given.existing] for residual, _ in each]).reshape(len(each), given.size)
+    push, lift = (z - at[0]).T / STEP, (np.array([doubt for _, doubt in each]) - at[1]) / STEP
     if usual is not None:
-        push, lift = np.concatenate([usual, push], 1), np.concatenate([np.zeros(k), lift])
-    own = u[mine[:k]]
-    cost = 0.5 * float(given.product(z[0], z[0])) + float(doubts[0]) + 0.5 * float(own @ own)
-    for block in blocks:
-        x = u[mine[block]]
-        cost += 0.5 * (1 + block.size) * float(np.log1p(x @ x))
-    return Evaluated(z[0], float(doubts[0]), push, lift, cost)
+        push = np.concatenate([usual, push], 1)
+        lift = np.concatenate([np.zeros(k), lift])
+    return Evaluated(*at[:2], push, lift, at[2])
 
 
 def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
@@ -343,7 +349,8 @@ def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
 
     Residuals are those that exist, in the order of the mask `whitening.weight > 0`.
     """
-    return evaluated(given, tuple(effects), u, columns_of(given, effects), []).push
+    effects, mine = tuple(effects), columns_of(given, effects)
+    return evaluated(given, effects, u, mine, cost_at(given, effects, u, mine, [])).push
 
 
 # Properties and effects fitted together, by Levenberg-Marquardt steps within the limits of each.
@@ -392,7 +399,8 @@ def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | No
     for key in start.effects:
         blocks.append(np.arange(at, at + len(free_parameters(key))))
         at += blocks[-1].size
-    now, damping = evaluated(given, start.effects, u, mine, blocks, usual), 1e-3
+    here = cost_at(given, start.effects, u, mine, blocks)
+    now, damping = evaluated(given, start.effects, u, mine, here, usual), 1e-3
     for _ in range(steps):
         prior = np.ones(mine.size)
         for block in blocks:
@@ -403,8 +411,9 @@ def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | No
         step, _ = least(bend + damping * np.diag(np.diag(bend)), -slope, low - u[mine], high - u[mine])
         trial = u.copy()
         trial[mine] = np.clip(u[mine] + step, low, high)
-        new = evaluated(given, start.effects, trial, mine, blocks, usual)
-        if np.isfinite(new.cost) and new.cost < now.cost:
+        here = cost_at(given, start.effects, trial, mine, blocks)
+        if np.isfinite(here[2]) and here[2] < now.cost:
+            new = evaluated(given, start.effects, trial, mine, here, usual)
             gained, u, now, damping = now.cost - new.cost, trial, new, damping / 5
             if gained < CLOSE:
                 break

@@ -17,7 +17,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.problem import Gap
 from simgap.bounded import least
-from simgap.effects import catalogue, decoys, fitted, forms_of, free_parameters, name_of
+from simgap.effects import catalogue, forms_of, free_parameters, name_of
 from simgap.effects.base import tips
 from simgap.gap.assemble import Scatter, gap_of, noise_gained, redrawn, scatters
 from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
@@ -27,6 +27,7 @@ from simgap.gap.problem import (
     Problem,
     Start,
     columns_of,
+    cost_at,
     evaluated,
     fit,
     limits,
@@ -46,14 +47,14 @@ PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be 
 
 
 def candidate_names(rig: Rig, excluded: Sequence[str] = (), forced: Sequence[str] = ()) -> list[str]:
-    """The effects to choose from, decoys included, or that are `forced`: a Cartesian hand has no joints."""
-    chosen = {n: e for n, e in catalogue().items() if e.chosen or n in forced} | decoys()
+    """The effects to choose from, or that are `forced`: a Cartesian hand has no joints."""
+    chosen = {n: e for n, e in catalogue().items() if e.chosen or n in forced}
     return [n for n, e in chosen.items() if n not in excluded and (rig.jointed or e.acts_on != "kinematics")]
 
 
 def shifting(names: Sequence[str]) -> list[str]:
     """Keys of all forms of those effects that shift signals (the others only scatter them)."""
-    return [key for n in names if fitted()[n].correct is not None for key in forms_of(n)]
+    return [key for n in names if catalogue()[n].correct is not None for key in forms_of(n)]
 
 
 def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
@@ -73,8 +74,9 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
     return out
 
 
-def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
-    """The best fit of one form of an effect, properties refitted; not refined where that promises nothing.
+def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMISING) -> Fitted:
+    """The best fit of one form of an effect, properties refitted; not refined where a linear step gains less
+    than what is `promising` [nats].
 
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
     what swings with it has no size. Properties start as they were measured: without the effect they may have
@@ -84,7 +86,7 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     base[: given.num_properties][given.measured.ravel()] = 0.0
     every, usual = starts(given, key, base), healthy.push
     ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
-    if healthy.cost - ranked[0][0] < PROMISING:
+    if healthy.cost - ranked[0][0] < promising:
         return fit(given, ranked[0][2], 0, usual)
     leading = [start for _, start, _ in ranked[:LEADERS]]
     if len(leading) > 1:
@@ -106,7 +108,8 @@ def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Sta
     columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
     u = start.u.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    now = evaluated(given, start.effects, u, columns, [], usual)
+    at = cost_at(given, start.effects, u, columns, [])
+    now = evaluated(given, start.effects, u, columns, at, usual)
     bend = given.product(now.push, now.push) + np.eye(columns.size)
     pull = -given.product(now.push, now.residual) - u[columns]
     step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
@@ -210,12 +213,13 @@ def search(
     tell: Progress = silent,
     identified: Identified | None = None,
     noisy: bool = True,
+    promising: float = PROMISING,
 ) -> Search:
     """Fit the catalogue, and what is `forced`, to aligned trials; InputError where none fits its task.
 
     `identified`: what `identify` made of the same trials, where that is known already. `noisy`: whether to
     see what sensors' noise makes of the candidates (`simgap.gap.assemble.redrawn`), which takes half of the
-    time.
+    time. `promising`: see `best_fit`.
     """
     misled: list[str] = []
     names, trials = candidate_names(aligned.rig, excluded, forced), [one.trial for one in aligned.trials]
@@ -234,7 +238,7 @@ def search(
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, Start((), neutral(given)))
-    fits = [best_fit(given, key, healthy) for key in keys]
+    fits = [best_fit(given, key, healthy, promising) for key in keys]
     others = redrawn(given) if noisy else ()
     for _ in range(ROUNDS if noisy else 0):
         again = _anew(every, aligned, given, healthy, fits, others)
@@ -270,7 +274,7 @@ def _anew(
 
     Late, slow or soft contacts displace boundaries, and what displaces fingers may look like a dropped block.
     """
-    best = _known(fits)[0]
+    best = min(fits, key=lambda f: f.cost)
     gained = healthy.cost - best.cost
     if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
         return None
@@ -299,11 +303,6 @@ def _recovered(
     return replace(again, trials=fit_now) if len(fit_now) > len(aligned.trials) else None
 
 
-def _known(fits: Sequence[Fitted]) -> list[Fitted]:
-    """The candidates of the catalogue, best first; decoys fit anything and move no boundary."""
-    return sorted((f for f in fits if name_of(f.effects[0]) not in decoys()), key=lambda f: f.cost)
-
-
 def _aligned_all(
     failed: AlignedTrials, actual: dict | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
@@ -318,7 +317,7 @@ def _aligned_all(
         healthy = fit(given, Start((), neutral(given)))
         if healthy.cost > HOPELESS * given.size:
             break
-        found = _known([best_fit(given, key, healthy) for key in keys])
+        found = sorted((best_fit(given, key, healthy) for key in keys), key=lambda f: f.cost)
         for f in found[:ATTEMPTS]:
             again = realigned(aligned, given, f)
             if 2 * sum(t.segmentation.complete for t in again.trials) > len(again.trials):

@@ -23,11 +23,11 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.posterior import forms
-from simgap.attribution.search import clear, sought, statistic
+from simgap.attribution.search import clear, doubtful, sought, statistic
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
 from simgap.gap.frame import as_from_wrist, of_wrist
-from simgap.gap.search import Identified, Search, search
+from simgap.gap.search import PROMISING, Identified, Search, search
 from simgap.progress import Progress, silent
 from simgap.source_digest import source_digest
 from simgap.world.operator import OperatorSettings, Plan
@@ -95,9 +95,7 @@ def recorded(
         *carried(simulated.t, simulated.boundaries, task, simulated.blocks),
     )
     chosen = [effect_named(n) for n in effects]
-    for effect in sorted(chosen, key=lambda e: -e.stage):
-        if effect.apply is not None:
-            truth = effect.apply(truth, dict(effects[effect.name]), rng)
+    truth = altered(truth, effects, rng)
     truth = truth if change is None else change(truth)
     t = times = simulated.trial.t
     for effect in chosen:
@@ -117,6 +115,14 @@ def recorded(
     return trial
 
 
+def altered(truth: Performance, effects: Values, rng: np.random.Generator) -> Performance:
+    """A performance as these effects change what sensors see of it, from the truth outwards."""
+    for effect in sorted(map(effect_named, effects), key=lambda e: -e.stage):
+        if effect.apply is not None:
+            truth = effect.apply(truth, dict(effects[effect.name]), rng)
+    return truth
+
+
 def carried(
     t: np.ndarray, boundaries: Sequence[float] | np.ndarray, task: BlockTask, blocks: Blocks
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -130,6 +136,7 @@ def carried(
 
 
 BATCHES = (1, 3, 4)  # numerics: twins that are simulated at once: the first alone is mostly enough
+PROMISES = 0.5  # numerics: share of what leaves doubt, below which no effect of a twin is refined
 LEAST = 1e-3  # numerics: a property below that cannot be simulated [N, m]
 QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
 
@@ -168,7 +175,7 @@ def twin_statistics(
             with suppress(InputError):  # a twin that drops its block is none
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
-                most = healthy_statistic(twin, actual, found.identified, noisy=False)
+                most = healthy_statistic(twin, actual, found.identified, False, PROMISES * doubtful(value))
                 sure = most <= 0 or clear(value, most)  # what is no sign of a gap counts as nothing
                 known.append(most if sure else healthy_statistic(twin, actual, found.identified))
                 keep_numbers(file, known)
@@ -176,10 +183,15 @@ def twin_statistics(
 
 
 def healthy_statistic(
-    aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None, noisy: bool = True
-) -> float:
-    """The statistic of one healthy recording, through the whole search; its blocks as `identified`."""
-    f = forms(search(aligned, actual, identified=identified, noisy=noisy).gap)
+    aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None, noisy: bool = True,
+    promising: float = 0.0,
+) -> float:  # fmt: skip
+    """The statistic of one healthy recording, through the whole search; its blocks as `identified`.
+
+    Effects are refined where a linear step gains as much as is `promising` [nats].
+    """
+    promising = max(promising, PROMISING)
+    f = forms(search(aligned, actual, identified=identified, noisy=noisy, promising=promising).gap)
     return statistic(f, sought(f, 1))
 
 
@@ -252,13 +264,11 @@ def settings(found: Search) -> OperatorSettings:
         return float(max(a, low)), float(max(b, low))
 
     pace = _carrying(usual) / max(float(np.median(spans.get("carry", [_carrying(usual)]))), 0.2)
-    out = replace(usual, pace=(pace, pace))
-    if grip:
-        out = replace(out, grip=between(grip, 0.3))
+    seen = {"pace": (pace, pace)} | ({"grip": between(grip, 0.3)} if grip else {})
     for name, own in (("pickup", "hold"), ("place", "place")):
         if name in spans:
-            out = replace(out, **{own: between([v * pace for v in spans[name]], 0.02)})
-    return out
+            seen[own] = between([v * pace for v in spans[name]], 0.02)
+    return OperatorSettings(**seen)
 
 
 def _carrying(usual: OperatorSettings) -> float:

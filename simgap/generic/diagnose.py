@@ -18,30 +18,22 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from math import comb
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from hmmseg.errors import InputError, nearest
-from simgap.attribution.attribute import Attribution, attribute
+from simgap.attribution.attribute import Attribution, ParameterPosterior, attribute
 from simgap.attribution.posterior import forms
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.attribution.search import sought, statistic
 from simgap.attribution.verdict import ALARM, entries, log_odds, rows
 from simgap.channels import delayed
 from simgap.effect import Parameter
-from simgap.generic.effects import Scene, Slot, effects, find_ring, predicted, scene, slots
-from simgap.generic.trials import (
-    FAST,
-    SLOW,
-    Ensembles,
-    Layout,
-    bin_edges,
-    both,
-    layout,
-    means,
-)
+from simgap.generic.effects import Scene, Slot, effects, predicted, scene, slots
+from simgap.generic.ring import find_ring
+from simgap.generic.trials import FAST, SLOW, Ensembles, Layout, bin_edges, both, layout, means
 from simgap.progress import Progress, silent
 
 MODERATION = 4.0  # prior: degrees of freedom that a cell's mean variance is worth
@@ -100,8 +92,7 @@ def diagnose(
                              nearest(name, list(effects())))  # fmt: skip
     lay = layout(ensembles)
     real, sim = both(lay)
-    given = scene(lay)
-    given = replace(given, ring=find_ring(given))
+    given = scene(lay, find_ring(lay))
     tell("fitting effects")
     white, gap = searched(given, real, sim)
     models = None
@@ -233,11 +224,9 @@ def gap_of(
     count, c = len(real), len(lay.ensembles.channels)
     channel = np.where(lay.channel < 0, 2 * c, lay.channel + c * (lay.kind == FAST))
     time = np.where(lay.kind == FAST, APART, 0.0) * np.arange(lay.kind.size)
-    edges = np.mean([cut.edges for cut in lay.ensembles.real], 0)
-    for k in range(len(lay.window)):
-        ends = bin_edges(lay, edges[k], edges[k + 1], k)
-        for own in range(c):
-            time[lay.where(SLOW, own, k)] = (ends[1:] + ends[:-1]) / 2
+    ends = bin_edges(lay, np.mean([cut.edges for cut in lay.ensembles.real], 0))
+    for own in range(c):
+        time[lay.of_channel(own)[: ends.size - 1]] = (ends[1:] + ends[:-1]) / 2
     names = lay.ensembles.channels
     parts = Rows(
         np.repeat(np.arange(count), lay.kind.size), np.tile(channel, count), np.tile(lay.subtask, count),
@@ -275,9 +264,7 @@ def shift_at(given: Scene, block: Block, mine: Sequence[Slot], u: np.ndarray) ->
     """Features (n,) of a block with effects at coordinates u, less those without."""
     values = [s.parameter.value(float(v)) for s, v in zip(mine, u, strict=True)]
     if block.channel < 0:
-        out = np.zeros(block.index.size)
-        np.add.at(out, [s.place for s in mine], values)
-        return out
+        return np.bincount([s.place for s in mine], values, block.index.size)
     acting, rung = dict[str, dict[str, float]](), np.zeros((len(given.layout.window), 2))
     for s, value in zip(mine, values, strict=True):
         if s.place >= 0:
@@ -295,22 +282,19 @@ def fit(given: Scene, white: Sequence[Block], difference: np.ndarray, names: Seq
     """
     out = []
     for block in white:
-        mine = [s for name in names for s in slots(given, name, block.channel)]
-        found = None
-        while mine and found is None:
-            found = _fitted(given, block, difference[block.index], mine)
-            inside = [not _ended(s.parameter, v) for s, v in zip(mine, found[0], strict=True)]
+        mine, inside = [s for name in names for s in slots(given, name, block.channel)], [False]
+        while mine and not all(inside):
+            u, slopes = _fitted(given, block, difference[block.index], mine)
+            inside = [not _ended(s.parameter, v) for s, v in zip(mine, u, strict=True)]
             if not all(inside):
-                mine, found = [s for s, kept in zip(mine, inside, strict=True) if kept], None
-        if found is None:
-            continue
-        u, moved, push = found
-        together = [range(len(mine))] if block.channel >= 0 else [[k] for k in range(len(mine))]
-        for part in map(list, together):
-            shift, slopes = np.zeros(difference.size), np.zeros((difference.size, len(part)))
-            slopes[block.index] = push[:, part]
-            shift[block.index] = moved if block.channel >= 0 else push[:, part] @ u[part]
-            out.append(Part(tuple(mine[k] for k in part), u[part], shift, slopes))
+                mine = [s for s, kept in zip(mine, inside, strict=True) if kept]
+        every = list(range(len(mine)))
+        # Durations are judged one by one.
+        for part in ([every] if block.channel >= 0 else [[k] for k in every]) if mine else ():
+            own, whole = tuple(mine[k] for k in part), np.zeros((difference.size, 1 + len(part)))
+            whole[block.index, 0] = shift_at(given, block, own, u[part])
+            whole[block.index, 1:] = slopes[:, part]
+            out.append(Part(own, u[part], whole[:, 0], whole[:, 1:]))
     return out
 
 
@@ -321,21 +305,17 @@ def _ended(p: Parameter, value: float) -> bool:
 
 def _fitted(
     given: Scene, block: Block, target: np.ndarray, mine: Sequence[Slot]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coordinates, shift and derivatives of the best of all starts, by least squares within bounds and with
-    normal priors."""
-    root, size = block.root * np.sqrt(block.trials), len(mine)
-    priors, ends = np.eye(size), np.array([s.parameter.limits for s in mine]).T
-
-    seen = dict[bytes, np.ndarray]()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates (k,) and derivatives (n, k) of the best of all starts, by least squares within bounds and
+    with normal priors."""
+    root, priors = block.root * np.sqrt(block.trials), np.eye(len(mine))
+    ends = np.array([s.parameter.limits for s in mine]).T
 
     def at(u: np.ndarray) -> np.ndarray:
-        if u.tobytes() not in seen:
-            seen[u.tobytes()] = shift_at(given, block, mine, u)
-        return seen[u.tobytes()]
+        return shift_at(given, block, mine, u)
 
     def push(u: np.ndarray) -> np.ndarray:
-        return np.stack([(at(u + step) - at(u)) / STEP for step in STEP * priors], 1)
+        return (np.stack([at(u + step) for step in STEP * priors], 1) - at(u)[:, None]) / STEP
 
     def left(u: np.ndarray) -> np.ndarray:
         return np.concatenate([root @ (target - at(u)), u])
@@ -344,13 +324,11 @@ def _fitted(
         return np.concatenate([-root @ push(u), priors])
 
     starts = [[s.parameter.coordinate(v) for v in s.parameter.starts or (0.0,)] for s in mine]
-    every = [[s[j % len(s)] for s in starts] for j in range(max(map(len, starts)))]
-    descents = [
-        least_squares(left, np.clip(u, *ends), jac=cast(Any, slopes), bounds=ends, ftol=CLOSE, max_nfev=STEPS)
-        for u in every
-    ]
+    every = [np.array([s[j % len(s)] for s in starts]) for j in range(max(map(len, starts)))]
+    given_to: dict[str, Any] = {"jac": slopes, "bounds": ends, "ftol": CLOSE, "max_nfev": STEPS}
+    descents = [least_squares(left, np.clip(u, *ends), **given_to) for u in every]
     u = min(descents, key=lambda d: d.cost).x
-    return u, at(u), push(u)
+    return u, push(u)
 
 
 def _candidates(white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:
@@ -363,26 +341,20 @@ def _candidates(white: Sequence[Block], found: Sequence[Part], count: int) -> li
 
 
 def _joint(given: Scene, white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:
-    """The effects of a joint fit as candidates where they are together; what they do only together is parted
-    evenly."""
-    whole = np.sum([p.shift for p in found], 0)
-    names, blocks = (
-        list(dict.fromkeys(s.effect for p in found for s in p.slots)),
-        {b.channel: b for b in white},
-    )
-    alone, own = {}, dict[str, list[Part]]()
+    """The effects of a joint fit as candidates where they are together: of each what is gone without it; what
+    they do only together is parted evenly."""
+    blocks = {b.channel: b for b in white}
+    names = list(dict.fromkeys(s.effect for p in found for s in p.slots))
+    whole, alone, own = np.sum([p.shift for p in found], 0), {}, {}
     for name in names:
-        alone[name] = np.zeros_like(whole)
+        alone[name], own[name] = np.zeros_like(whole), list[Part]()
         for p in found:
             mine, block = np.array([s.effect == name for s in p.slots]), blocks[p.slots[0].channel]
-            if mine.all():
-                alone[name] += p.shift
-            elif mine.any():
+            if mine.any():
                 rest = shift_at(given, block, p.slots, np.where(mine, 0.0, p.u))
                 alone[name][block.index] += p.shift[block.index] - rest
-            if mine.any():
                 kept = tuple(s for s in p.slots if s.effect == name)
-                own.setdefault(name, []).append(Part(kept, p.u[mine], p.shift, p.slopes[:, mine]))
+                own[name].append(Part(kept, p.u[mine], p.shift, p.slopes[:, mine]))
     more = (whole - np.sum(list(alone.values()), 0)) / len(names)
     return [_candidate(white, own[name], alone[name] + more, count) for name in names]
 
@@ -414,15 +386,14 @@ def _document(
     warnings = [*lay.ensembles.warnings]
     if len(real) == 1:
         warnings.append("one real trial: nothing is held out, and an accident of it looks like an effect")
-    shift, variance = np.zeros(lay.kind.size), np.zeros(lay.kind.size)
+    shift, variance, moved = (np.zeros(lay.kind.size) for _ in range(3))
     for n in leading:
         e = verdict.effects[n]
         c = gap.candidates[e.candidate]
         x = np.array([p.mean for p in e.parameters.values()])
-        moved = (c.shift + c.jacobian @ (x - c.at))[: lay.kind.size]
-        for block in white:
-            shift[block.index] += np.linalg.solve(block.root, moved[block.index])
+        moved += (c.shift + c.jacobian @ (x - c.at))[: lay.kind.size]
     for block in white:
+        shift[block.index] = np.linalg.solve(block.root, moved[block.index])
         variance[block.index] = block.variance
     return GenericDiagnosis(body, given, verdict, real, sim, variance, shift, leading, tuple(warnings))
 
@@ -451,35 +422,31 @@ def _described(given: Scene, verdict: Attribution, names: Sequence[str]) -> dict
             }  # fmt: skip
 
 
-def _parameters(given: Scene, name: str, found: Mapping[str, Any]) -> dict[str, Any]:
+def _parameters(given: Scene, name: str, found: Mapping[str, ParameterPosterior]) -> dict[str, Any]:
     """An effect's parameters in units, by channel or subtask; of a vibration frequency, damping and size."""
     lay, out = given.layout, dict[str, Any]()
     rung = dict[tuple[int, int], list[tuple[float, float]]]()
     of = {s.label: s for c in (*range(len(lay.ensembles.channels)), -1) for s in slots(given, name, c)}
     for label, value in found.items():
         slot, p = of[label], of[label].parameter
-        mean, sd = p.value(value.mean), p.sd * value.sd
-        low, high = (p.value(v) for v in value.interval_90)
+        mean, sd, ends = p.value(value.mean), p.sd * value.sd, [p.value(v) for v in value.interval_90]
         if slot.channel < 0:
             ratio = float(np.exp(mean))
-            out[lay.ensembles.subtasks[slot.place]] = _entry(ratio, ratio * sd, np.exp([low, high]), "1")
+            out[lay.ensembles.subtasks[slot.place]] = _entry(ratio, ratio * sd, np.exp(ends), "1")
         elif slot.place >= 0:
             rung.setdefault((slot.channel, slot.place), []).append((mean, sd))
         else:
             channel = lay.ensembles.channels[slot.channel]
             key = channel if len(effects()[name].parameters) == 1 else f"{channel}.{p.name}"
-            out[key] = _entry(mean, sd, (low, high), p.unit)
-    if rung and given.ring is not None:
-        ring = given.ring
+            out[key] = _entry(mean, sd, ends, p.unit)
+    if rung and (ring := given.ring) is not None:
         size, sd, c = max((*map(float, np.hypot(*np.reshape(v, (-1, 2)))), c) for (c, _), v in rung.items())
-        out |= {
-            "frequency": _entry(ring.frequency, ring.frequency_sd, ring.frequency_90, "Hz"),
-            "damping": _entry(ring.damping, ring.damping_sd, ring.damping_90, "1"),
-            "gain": _entry(size, sd, (max(size - 1.645 * sd, 0.0), size + 1.645 * sd),
-                           f"unit of {lay.ensembles.channels[c]}"),
-        }  # fmt: skip
+        ends, unit = (max(size - 1.645 * sd, 0.0), size + 1.645 * sd), lay.ensembles.channels[c]
+        out |= {"frequency": _entry(ring.frequency, ring.frequency_sd, ring.frequency_90, "Hz"),
+                "damping": _entry(ring.damping, ring.damping_sd, ring.damping_90, "1"),
+                "gain": _entry(size, sd, ends, f"unit of {unit}")}  # fmt: skip
     return out
 
 
-def _entry(mean: float, sd: float, interval: Any, unit: str) -> dict[str, Any]:
+def _entry(mean: float, sd: float, interval: Iterable[float], unit: str) -> dict[str, Any]:
     return {"mean": mean, "sd": sd, "interval_90": [float(v) for v in interval], "unit": unit}

@@ -196,6 +196,11 @@ class Layout:
     kind: np.ndarray
     width: np.ndarray
 
+    @property
+    def least(self) -> np.ndarray:
+        """Power (C,) below which a channel's is no different from none."""
+        return (FLOOR * self.scale) ** 2
+
     def where(self, kind: int, channel: int, subtask: int) -> np.ndarray:
         """Indices of the features of one kind in a channel and subtask."""
         return np.flatnonzero((self.kind == kind) & (self.channel == channel) & (self.subtask == subtask))
@@ -231,13 +236,16 @@ def layout(given: Ensembles) -> Layout:
     return Layout(given, rate, scale, event, window, subs, bins, *np.array(rows).T)
 
 
-def bin_edges(given: Layout, start: float, end: float, subtask: int) -> np.ndarray:
-    """Edges [s] of the parts of a subtask that lasts from start to end."""
-    count, early = int(given.bins[subtask]), float(given.event[subtask])
-    if not early or count < BINS:
-        return np.linspace(start, end, count + 1)
-    first = np.linspace(start, start + early, EARLY + 1)
-    return np.concatenate([first, np.linspace(first[-1], end, count - EARLY + 1)[1:]])
+def bin_edges(given: Layout, edges: np.ndarray) -> np.ndarray:
+    """Edges [s] of the parts of all subtasks (sum of `bins` + 1,), which lie between `edges` (K + 1,) [s]."""
+    out = [edges[:1]]
+    for start, end, count, early in zip(edges, edges[1:], given.bins, given.event, strict=False):
+        if not early or count < BINS:
+            out.append(np.linspace(start, end, count + 1)[1:])
+        else:
+            out.append(np.linspace(start, start + early, EARLY + 1)[1:])
+            out.append(np.linspace(start + early, end, count - EARLY + 1)[1:])
+    return np.concatenate(out)
 
 
 def _sub_bands(low: int, window: int) -> tuple[slice, ...]:
@@ -304,31 +312,33 @@ def windowed(
     return resampled(t, values, np.clip(times, t[0], t[-1]), given.rate)
 
 
-def log_power(given: Layout, spectrum: np.ndarray, channel: int, subtask: int) -> np.ndarray:
-    """Log mean power of the sub-bands (..., B) of spectra (..., window)."""
-    parts = [spectrum[..., s].mean(-1) for s in given.coefficients[subtask]]
-    floor = (FLOOR * given.scale[channel]) ** 2
-    return np.log(np.stack(parts, -1) + floor) if parts else np.zeros((*spectrum.shape[:-1], 0))
+def powers(
+    given: Layout, cuts: Sequence[Cut], channel: int, values: Sequence[np.ndarray | None] | None = None
+) -> np.ndarray:
+    """Mean powers (num_cuts, num_bands) of all subtasks' sub-bands in a channel, or in `values` instead."""
+    out, every = [np.zeros((len(cuts), 0))], [None] * len(cuts) if values is None else values
+    for k, own in enumerate(given.coefficients):
+        if own:
+            each = [windowed(given, c, channel, k, v) for c, v in zip(cuts, every, strict=True)]
+            power = transformed(np.array(each)) ** 2
+            starts = [s.start for s in own]  # each ends where the next begins, the last with the window
+            out.append(np.add.reduceat(power, starts, 1) / np.diff([*starts, own[-1].stop]))
+    return np.concatenate(out, 1)
 
 
 def features(given: Layout, cut: Cut) -> np.ndarray:
     """All features (F,) of one trial: means in the channel's unit, log powers, log durations."""
-    out = np.zeros(given.kind.size)
-    for k in range(len(given.ensembles.subtasks)):
-        edges = bin_edges(given, cut.edges[k], cut.edges[k + 1], k)
-        out[given.where(DURATION, -1, k)] = np.log(edges[-1] - edges[0])
-        for c, name in enumerate(given.ensembles.channels):
-            values = cut.trial.channels[name]
-            known = np.isfinite(values)
-            out[given.where(SLOW, c, k)] = means(cut.trial.t[known], values[known], edges)
-            if given.coefficients[k]:
-                power = transformed(windowed(given, cut, c, k)) ** 2
-                out[given.where(FAST, c, k)] = log_power(given, power, c, k)
+    out, edges = np.zeros(given.kind.size), bin_edges(given, cut.edges)
+    out[given.of_channel(-1)] = np.log(np.diff(cut.edges))
+    for c, name in enumerate(given.ensembles.channels):
+        values = cut.trial.channels[name]
+        known = np.isfinite(values)
+        course, power = means(cut.trial.t[known], values[known], edges), powers(given, [cut], c)[0]
+        out[given.of_channel(c)] = np.concatenate([course, np.log(power + given.least[c])])
     return out
 
 
 def both(given: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Features of the real trials (R, F) and of the simulated ones (S, F)."""
-    real, sim = (np.array([features(given, c) for c in kind])
-                 for kind in (given.ensembles.real, given.ensembles.sim))  # fmt: skip
-    return real, sim
+    real, sim = ([features(given, c) for c in kind] for kind in (given.ensembles.real, given.ensembles.sim))
+    return np.array(real), np.array(sim)

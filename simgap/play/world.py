@@ -13,10 +13,13 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from simgap.effects import catalogue
 from simgap.effects.base import HandEffect, Performance
+from simgap.gap.twins import Values, altered, scene_of
 from simgap.world.dynamics import CONTROL_PERIOD
-from simgap.world.properties import Block, Blocks
+from simgap.world.properties import Blocks
 from simgap.world.virtual_model import Surroundings, VirtualModel, finite_stiffness
 
+SOFTEST = 50.0  # look: N/m; a softer pad would let the fingers through
+SLIPPIEST = 1e-3  # look: the least friction
 OFTEN = 3.0  # look: prior standard deviations of a sensor's effect: strong enough to be seen
 
 
@@ -45,33 +48,23 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
     return dict(usual) | {key: float(value) for key, value in (given or {}).items() if np.isfinite(value)}
 
 
-def scene_with(effects: Mapping[str, Mapping[str, float]], rig: Rig, blocks: Blocks
-               ) -> tuple[Rig, dict[str, Block], Surroundings]:  # fmt: skip
-    """Rig, blocks and surroundings with the scene effects among these."""
-    around, changed, known = Surroundings(), dict(blocks), felt_effects()
-    for name, values in effects.items():
-        scene = known[name].scene
-        for key, value in (scene(dict(values)) if scene is not None else {}).items():
-            if key == "friction":
-                changed = {each: replace(block, friction=max(value, 1e-3)) for each, block in changed.items()}
-            elif key in ("normal_stiffness", "shear_stiffness"):
-                size = float(np.clip(value, 50.0, finite_stiffness(np.inf)))
-                rig = rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update={key: size})})
-            else:
-                around = replace(around, **{key: value})
-    return rig, changed, around
+def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, Surroundings]:
+    """Rig, blocks and surroundings with the scene effects among these, pads no softer than can be played."""
+    hand, around, blocks = scene_of(rig, blocks, effects)
+    stiff = {n: getattr(hand.fingertip, n) for n in ("normal_stiffness", "shear_stiffness")}
+    pads = {n: float(np.clip(v, SOFTEST, finite_stiffness(np.inf))) for n, v in stiff.items()}
+    hand = hand.model_copy(update={"fingertip": hand.fingertip.model_copy(update=pads)})
+    return hand, {n: replace(b, friction=max(b.friction, SLIPPIEST)) for n, b in blocks.items()}, around
 
 
-def sensed(effects: Mapping[str, Mapping[str, float]], t: np.ndarray, position: np.ndarray,
-           velocity: np.ndarray, force: np.ndarray, rig: Rig) -> np.ndarray:  # fmt: skip
+def sensed(
+    effects: Values, t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig
+) -> np.ndarray:
     """Forces (n, 2, 2) [N] as sensors with these effects say them, of a stretch of motion at times t (n,)."""
-    known, nothing = felt_effects(), np.zeros(t.size)
-    performance = Performance(t, position, velocity, force, np.zeros(0), rig, nothing, nothing + 1.0)
-    for name, values in effects.items():
-        apply = known[name].apply
-        if apply is not None and known[name].acts_on == "sensing":
-            performance = apply(performance, dict(values), np.random.default_rng(0))
-    return performance.force
+    nothing, known = np.zeros(t.size), felt_effects()
+    mine = {name: values for name, values in effects.items() if known[name].acts_on == "sensing"}
+    truth = Performance(t, position, velocity, force, np.zeros(0), rig, nothing, nothing + 1.0)
+    return altered(truth, mine, np.random.default_rng(0)).force
 
 
 # look: a fingertip's mass [kg], spring [N/m] and damping (ratio): the middle of what operators are drawn
@@ -87,15 +80,8 @@ class PlayedWorld:
     `position`, `velocity`, `force` (2 fingers, 2 axes) [m, m/s, N]: the tips now and what they exert.
     """
 
-    def __init__(
-        self,
-        task: BlockTask,
-        rig: Rig,
-        blocks: Blocks,
-        x: Mapping[str, float],
-        start: np.ndarray,
-        effects: Mapping[str, Mapping[str, float]] | None = None,
-    ) -> None:
+    def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, x: Mapping[str, float], start: np.ndarray,
+                 effects: Values | None = None) -> None:  # fmt: skip
         self.effects = dict(effects or {})
         self.rig, self.blocks, around = scene_with(self.effects, rig, blocks)
         self.model = VirtualModel(self.rig, task, self.blocks, x, around)

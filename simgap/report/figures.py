@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
 from simgap.generic.diagnose import GenericDiagnosis
-from simgap.generic.trials import SLOW, bin_edges
+from simgap.generic.trials import SLOW
 from simgap.report.finding import CHANNELS, by_place, chances, plain_name, share_of
 from simgap.report.robot import Course, Own, courses
 from simgap.robots.changes import Changes
@@ -121,8 +121,16 @@ def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
     }[channel]  # fmt: skip
 
 
-def draw_signal(found: Diagnosis, path: Path) -> None:
-    """The channel and trial of the largest excess: the signal, and its whitened residual beneath."""
+def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
+    """The signal where the excess is largest, with its whitened residual beneath."""
+    if isinstance(found, GenericDiagnosis):
+        _draw_mean_course(found, path)
+    else:
+        _draw_trial(found, path)
+
+
+def _draw_trial(found: Diagnosis, path: Path) -> None:
+    """The channel and trial of the largest excess: recorded, simulated, corrected."""
     frame = found.problem.frame
     cell = max(found.cells, key=lambda c: c.energy - c.count)
     r, c, n = cell.trial, list(CHANNELS).index(cell.channel), frame.lengths[cell.trial]
@@ -150,16 +158,14 @@ def draw_signal(found: Diagnosis, path: Path) -> None:
         above.set_title(f"{cell.channel} in {frame.files[r]}, largest gap shaded", loc="left")
 
 
-def draw_generic(found: GenericDiagnosis, path: Path) -> None:
+def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:
     """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
     lay = found.scene.layout
     excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
     courses = [(c, k) for c in range(len(lay.ensembles.channels)) for k in range(len(lay.ensembles.subtasks))]
     channel, worst = max(courses, key=lambda cell: excess[lay.where(SLOW, *cell)].mean())
     index = np.concatenate([lay.where(SLOW, channel, k) for k in range(len(lay.ensembles.subtasks))])
-    ends = found.scene.edges
-    edges = [bin_edges(lay, ends[k], ends[k + 1], k) for k in range(ends.size - 1)]
-    t = np.concatenate([(e[1:] + e[:-1]) / 2 for e in edges])
+    t = (found.scene.bins[1:] + found.scene.bins[:-1]) / 2
     real, sim = found.real[:, index], found.sim[:, index]
     with canvas(path, height=3.8) as figure:
         above, below = figure.subplots(2, 1, sharex=True)

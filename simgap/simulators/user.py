@@ -16,9 +16,9 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from simgap.effect import STATED, Parameter
 from simgap.simulators.protocol import Channel, Channels, Job, Simulator, Values, finite
 from simgap.simulators.recording import Recording
 
+Kind = TypeVar("Kind", Parameter, Channel)
 PATIENCE = 300.0  # limit: s that one call may take, unless the simulator states a `timeout` of its own
 LONGEST = 1e6  # limit: s; more is a slip of the pen
 BY_LOG = ("shift", "offset")  # what each log may have of its own (`simgap.robot_effects.readouts`)
@@ -165,23 +166,19 @@ class Checks:
         try:
             out = {str(n): (float(v), float(sd)) for n, (v, sd) in dict(found).items()}
         except (TypeError, ValueError, OverflowError):
-            raise InputError(self.of(run), f"gave {_shown(found)}",
-                             "{state: (value, standard deviation)}") from None  # fmt: skip
+            expected = "{state: (value, standard deviation)}"
+            raise InputError(self.of(run), f"gave {_shown(found)}", expected) from None
         for name, (value, sd) in out.items():
             if not (math.isfinite(value) and math.isfinite(sd) and sd >= 0):
-                raise InputError(
-                    self.of(run), f"state {name}: {value} with standard deviation {sd}", "numbers"
-                )
+                wrong = f"state {name}: {value} with standard deviation {sd}"
+                raise InputError(self.of(run), wrong, "numbers")
         return out
 
     def contacts(self, run: Callable[..., Any], recording: Recording) -> list[float]:
         """Times [s]."""
         found = self.call(run, _lent(recording))
-        try:
-            times = np.asarray(found, float)
-        except (TypeError, ValueError, OverflowError):
-            times = np.full((1, 1), np.nan)
-        if times.ndim != 1 or not np.isfinite(times).all():
+        times = _numbers(found)
+        if times is None or times.ndim != 1 or not np.isfinite(times).all():
             raise InputError(self.of(run), f"gave {_shown(found)}", "times [s] in one row")
         return [float(t) for t in times]
 
@@ -189,23 +186,19 @@ class Checks:
         """A run's channels as arrays (num_timesteps,); InputError names the one at fault."""
         if not isinstance(found, Mapping):
             raise InputError(self.of(run), f"gave {_shown(found)}", "a dict of channels")
-        out = {}
+        out, rows = {}, len(recording)
         for name in self.channels:
             if name not in found:
                 raise InputError(self.of(run), f"gave no channel {name!r}", f"{', '.join(self.channels)}")
             with calling(self.where, self.file):
-                values = np.asarray(found[name])
-            where, rows = f"{self.of(run)}: channel {name}", len(recording)
-            if values.shape != (rows,):
-                raise InputError(where, f"gave {_shown(found[name])}", f"{rows} numbers, one for each time")
-            if values.dtype.kind not in "biuf":
-                try:
-                    values = values.astype(float) if values.dtype.kind == "O" else None
-                except (TypeError, ValueError, OverflowError):
-                    values = None
-                if values is None:
-                    raise InputError(where, f"gave {_shown(found[name])}", "real numbers")
-            out[name] = np.array(values, float)
+                shape = np.shape(found[name])
+            where, gave = f"{self.of(run)}: channel {name}", f"gave {_shown(found[name])}"
+            if shape != (rows,):
+                raise InputError(where, gave, f"{rows} numbers, one for each time")
+            values = _numbers(found[name])
+            if values is None:
+                raise InputError(where, gave, "real numbers")
+            out[name] = values
         return out
 
     def of(self, run: Callable[..., Any]) -> str:
@@ -215,6 +208,15 @@ class Checks:
 
 
 SAID = 200  # look: characters of a user's own message
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """A copy of real numbers, whole ones and logical ones among them; None where it holds others."""
+    try:
+        found = np.asarray(value)
+        return np.array(found, float) if found.dtype.kind in "biufO" else None
+    except (TypeError, ValueError, OverflowError):
+        return None
 
 
 def _shown(value: Any) -> str:
@@ -228,13 +230,14 @@ def _shown(value: Any) -> str:
 
 def _lent(recording: Recording) -> Recording:
     """The recording with arrays that cannot be written to."""
-    columns = {}
-    for name, values in recording.columns.items():
-        columns[name] = values.view()
-        columns[name].flags.writeable = False
-    t = recording.t.view()
-    t.flags.writeable = False
-    return Recording(recording.name, t, columns, recording.first)
+
+    def lent(values: np.ndarray) -> np.ndarray:
+        out = values.view()
+        out.flags.writeable = False
+        return out
+
+    columns = {name: lent(values) for name, values in recording.columns.items()}
+    return replace(recording, t=lent(recording.t), columns=columns)
 
 
 def checked(found: Any, where: str) -> UserSimulator:
@@ -245,52 +248,40 @@ def checked(found: Any, where: str) -> UserSimulator:
 
 
 def _checked(found: Any, where: str, file: str) -> UserSimulator:
-    run = found if inspect.isfunction(found) else getattr(found, "simulate", None)
+    def own(name: str) -> Any:
+        return getattr(found, name, None)
+
+    run = found if inspect.isfunction(found) else own("simulate")
     for name in ("parameters", "channels"):
-        if not isinstance(getattr(found, name, None), Mapping):
+        if not isinstance(own(name), Mapping):
             raise InputError(where, f"has no mapping {name!r}", "parameters, channels and simulate")
     if not callable(run):
         raise InputError(where, "cannot be run", "a method simulate(parameters, recording, start=None)")
     parameters = {n: _made(Parameter, v, f"{where}: parameter {n}") for n, v in found.parameters.items()}
     channels = {n: _made(Channel, v, f"{where}: channel {n}") for n, v in found.channels.items()}
-    if all(c.kind == "command" for c in channels.values()):
+    by_log = {n: _made(Parameter, v, f"{where}: by_log {n}") for n, v in (own("by_log") or {}).items()}
+    compared = tuple(n for n, c in channels.items() if c.kind != "command")
+    if not compared:
         raise InputError(where, "has no channel to compare", "one that is no command")
-    limits = {n: getattr(found, n, None) for n in ("window", "timeout")}
-    for name, value in limits.items():
+    for name in ("window", "timeout"):
+        value = own(name)
         if value is not None and not (isinstance(value, int | float) and 0 < value <= LONGEST):
             raise InputError(f"{where}: {name}", f"{value!r}", f"seconds above 0, {LONGEST:g} at most")
-    wanted = tuple(n for n, c in channels.items() if c.kind != "command")
-    checks = Checks(where, file, float(limits["timeout"] or PATIENCE), wanted)
-    optional = {}
-    for name in ("state_at", "contacts", "simulate_many"):
-        own = getattr(found, name, None)
-        optional[name] = None if own is None else functools.partial(getattr(checks, name), own)
-    says = dict(getattr(found, "says", None) or {})
-    restarted = "start" in inspect.signature(run).parameters
-    given = getattr(found, "by_log", None) or {}
-    by_log = {n: _made(Parameter, v, f"{where}: by_log {n}") for n, v in given.items()}
-    for name in by_log:
-        if name not in BY_LOG:
-            raise InputError(f"{where}: by_log {name}", "unknown key", nearest(name, BY_LOG))
-    poses = dict(getattr(found, "poses", None) or {})
-    numerics = frozenset(getattr(found, "numerics", None) or ())
-    for name in numerics - parameters.keys():
-        raise InputError(f"{where}: numerics", f"no parameter {name}", nearest(name, list(parameters)))
+    numerics = frozenset(own("numerics") or ())
+    for what, names, known in (("by_log", by_log, BY_LOG), ("numerics", numerics, list(parameters))):
+        for name in (n for n in names if n not in known):
+            raise InputError(f"{where}: {what}", f"no parameter {name}", nearest(name, known))
+    checks = Checks(where, file, float(own("timeout") or PATIENCE), compared)
+    offered = {n: own(n) for n in ("state_at", "contacts", "simulate_many")}
     return UserSimulator(
-        parameters,
-        channels,
-        functools.partial(checks.simulate, run),
-        restarted,
-        says=says,
-        poses=poses,
-        by_log=by_log,
-        numerics=numerics,
-        window=limits["window"],
-        **optional,
-    )
+        parameters, channels, functools.partial(checks.simulate, run),
+        "start" in inspect.signature(run).parameters, says=dict(own("says") or {}),
+        poses=dict(own("poses") or {}), by_log=by_log, numerics=numerics, window=own("window"),
+        **{n: functools.partial(getattr(checks, n), f) for n, f in offered.items() if f is not None},
+    )  # fmt: skip
 
 
-def _made(kind: type, value: Any, where: str) -> Any:
+def _made(kind: type[Kind], value: Any, where: str) -> Kind:
     """A Parameter or Channel from one, or from a dict of its fields."""
     if isinstance(value, kind):
         return value

@@ -16,6 +16,7 @@ from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import inverse
 from hmmseg.io.rig import Rig
 from hmmseg.plot.style import BLUE, GREY, INK, OTHER_COLOURS, STYLE
+from simgap.world.dynamics import Record
 from simgap.world.properties import Block
 
 FRAMES = 15.0  # look: a second, in real time
@@ -34,11 +35,10 @@ class Trace:
 
 @dataclass(frozen=True)
 class Scene:
-    """What moves: t (T,) [s], tips (T, 2, 2) and block centres (T, B, 2) [m]; blocks by name."""
+    """What moves, at times t (T,) [s]; blocks by name, in the motion's order."""
 
     t: np.ndarray
-    tips: np.ndarray
-    centres: np.ndarray
+    motion: Record
     blocks: dict[str, Block]
     rig: Rig
 
@@ -61,10 +61,10 @@ def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
         figure.set_layout_engine("none")  # laid out once; the rest only moves
         with writer.saving(figure, str(path), DPI):
             for k in _chosen(scene.t):
-                for body, (x, y) in zip(bodies, 100 * scene.centres[k], strict=True):
+                for body, (x, y) in zip(bodies, 100 * scene.motion.blocks[k], strict=True):
                     body.set_xy((x - body.get_width() / 2, y - body.get_height() / 2))
                 for finger, pad in enumerate(pads):
-                    x, y = 100 * scene.tips[k, finger]
+                    x, y = 100 * scene.motion.position[k, finger]
                     pad.set_xy((x - (100 * PAD[0] if finger == 0 else 0.0), y - 50 * PAD[1]))
                 for line, chain in zip(links, joints, strict=True):
                     line.set_data(*(100 * chain[k].T))
@@ -87,8 +87,8 @@ def _chosen(t: np.ndarray) -> np.ndarray:
 
 def _draw_scene(stage, scene: Scene):
     """Ground, blocks, pads and links at their first place; the artists that move."""
-    seen = np.concatenate([scene.tips.reshape(-1, 2), scene.centres.reshape(-1, 2)])
-    left, right = scene.tips[..., 0].min(), scene.tips[..., 0].max()
+    seen = np.concatenate([scene.motion.position.reshape(-1, 2), scene.motion.blocks.reshape(-1, 2)])
+    left, right = scene.motion.position[..., 0].min(), scene.motion.position[..., 0].max()
     near = 100 * seen[(seen[:, 0] > left - 0.1) & (seen[:, 0] < right + 0.1)]  # a block never met is far
     (left, _), (right, top) = near.min(axis=0), near.max(axis=0)
     stage.set(
@@ -115,10 +115,10 @@ def _joints(scene: Scene) -> list[np.ndarray]:
     chains = []
     for i in (1, 2) if scene.rig.jointed else ():
         finger = scene.rig.finger(i)
-        q = inverse(finger, i, scene.tips[:, i - 1])
+        q = inverse(finger, i, scene.motion.position[:, i - 1])
         base = np.broadcast_to(np.asarray(finger.base), (len(q), 2))
         elbow = base + finger.links[0] * np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], -1)
-        chains.append(np.stack([base, elbow, scene.tips[:, i - 1]], 1))
+        chains.append(np.stack([base, elbow, scene.motion.position[:, i - 1]], 1))
     return chains
 
 

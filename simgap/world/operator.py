@@ -8,21 +8,20 @@ Neurosci. 3, 1991); physiological tremor lies at 6-12 Hz.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator
 
-from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
-from hmmseg.io.schema import read_toml
+from hmmseg.io.schema import Finite, FinitePositive, StrictTable, read_json, read_toml, validated
 from hmmseg.io.task import BlockTask, Move
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.properties import Blocks, Tabletop, lay_out
 from simgap.world.virtual_model import finite_stiffness
 
-Range = tuple[float, float]
 TREMOR_BAND = (6.0, 12.0)  # cited: Hz
 WANDER_BAND = (0.1, 0.6)  # prior: Hz
 HOVER = 0.008  # look: m; open fingers pass this far above the highest block
@@ -30,8 +29,21 @@ NEAR = 0.0025  # look: m above touchdown, where a quick descent becomes a slow a
 PACE = 5.0  # cited: s a move at least, the paper's (two moves in 10 s)
 
 
-@dataclass(frozen=True)
-class OperatorSettings:
+def _pair(given: Any) -> Any:
+    return [given, given] if isinstance(given, int | float) else given
+
+
+def _rising(given: tuple[float, float]) -> tuple[float, float]:
+    if not given[0] <= given[1]:
+        raise ValueError(f"is {given}; expected (low, high), low <= high")
+    return given
+
+
+Range = Annotated[tuple[Finite, Finite], BeforeValidator(_pair), AfterValidator(_rising)]
+Above = Annotated[tuple[FinitePositive, Finite], BeforeValidator(_pair), AfterValidator(_rising)]
+
+
+class OperatorSettings(StrictTable):
     """How the operator works: every quantity is drawn uniformly from its range for each motion.
 
     Times [s], lengths [m], forces [N]; `pace` divides all durations of motion and dwell. The
@@ -39,7 +51,7 @@ class OperatorSettings:
     trial, as are `offset` (of the fingers' heights) and rms `tremor` and `wander` of each tip.
     """
 
-    grip: Range = (2.0, 3.2)
+    grip: Above = (2.0, 3.2)
     press: Range = (0.9, 1.9)
     slide_press: Range = (0.0, 0.2)
     rest: Range = (0.2, 0.5)
@@ -62,46 +74,17 @@ class OperatorSettings:
     offset: Range = (-0.0005, 0.0005)
     tremor: Range = (2.5e-5, 5.5e-5)
     wander: Range = (3e-5, 1.8e-4)
-    hand_stiffness: Range = (350.0, 550.0)
-    hand_mass: Range = (0.10, 0.18)
-    hand_damping: Range = (0.7, 1.0)
-    pace: Range = (1.0, 1.0)
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            low, high = getattr(self, name)
-            if not (np.isfinite([low, high]).all() and low <= high):
-                raise ValueError(f"operator {name} is {(low, high)}; expected (low, high), low <= high")
-        for name in ("grip", "pace", "hand_stiffness", "hand_mass", "hand_damping"):
-            if getattr(self, name)[0] <= 0:
-                raise ValueError(f"operator {name} starts at {getattr(self, name)[0]}; expected above 0")
+    hand_stiffness: Above = (350.0, 550.0)
+    hand_mass: Above = (0.10, 0.18)
+    hand_damping: Above = (0.7, 1.0)
+    pace: Above = (1.0, 1.0)
 
 
 def read_operator(path: str | Path) -> OperatorSettings:
     """Settings from a TOML or JSON file: [low, high] or one number by name; InputError for others."""
-    path = Path(path)
-    if path.suffix.lower() == ".json":
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(str(path), f"cannot be read ({error})", "operator settings") from None
-    else:
-        table = read_toml(path)
-    if not isinstance(table, dict):
-        raise InputError(str(path), "holds no table", "operator settings by name")
-    settings = {}
-    for name, value in table.items():
-        if name not in OperatorSettings.__dataclass_fields__:
-            raise InputError(f"{path}: key {name}", "unknown key",
-                             nearest(name, OperatorSettings.__dataclass_fields__))  # fmt: skip
-        pair = value if isinstance(value, list) else [value, value]
-        if len(pair) != 2 or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in pair):
-            raise InputError(f"{path}: key {name}", f"found {value!r}", "a number or [low, high]")
-        settings[name] = (float(pair[0]), float(pair[1]))
-    try:
-        return OperatorSettings(**settings)
-    except ValueError as error:
-        raise InputError(str(path), str(error)) from None
+    json = Path(path).suffix.lower() == ".json"
+    table = read_json(path, "operator settings") if json else read_toml(path)
+    return validated(OperatorSettings, table, str(path))
 
 
 @dataclass(frozen=True)
@@ -261,7 +244,9 @@ def plan(task: BlockTask, rig: Rig, blocks: Blocks, settings: OperatorSettings,
     return Plan(tips, (performer.mass, performer.stiffness, damping), start, windows, duration)
 
 
-def _oscillation(t: np.ndarray, band: Range, rms: float, rng: np.random.Generator) -> np.ndarray:
+def _oscillation(
+    t: np.ndarray, band: tuple[float, float], rms: float, rng: np.random.Generator
+) -> np.ndarray:
     """Narrow-band motion [m] of a given rms: sinusoids with random frequencies and phases."""
     count = 6
     frequency, phase = rng.uniform(*band, (count, 1)), rng.uniform(0, 2 * np.pi, (count, 1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from copy import deepcopy
@@ -16,7 +15,9 @@ from rich.table import Table
 from estimation.report import LIMITS, number, read_actual
 from hmmseg.contact.decompose import UNITS
 from hmmseg.errors import InputError
+from hmmseg.io.schema import read_json
 from hmmseg.io.task import GROUND, BlockTask, Move
+from hmmseg.tables import listed
 
 DEFAULT_FRICTION = 1.2  # prior: of foam on a block, where nothing says otherwise
 
@@ -51,13 +52,11 @@ def paper_blocks(task: BlockTask) -> dict[str, Block]:
 
 def blocks_table(blocks: Blocks) -> Table:
     """Blocks for people to read, lengths in cm as the paper has them."""
-    table = Table(title="blocks", title_justify="left")
-    for head in ("block", "weight", "width", "height", "friction"):
-        table.add_column(head)
+    rows = []
     for name, b in blocks.items():
         lengths = (f"{100 * length:.4g} cm" for length in (b.width, b.height))
-        table.add_row(name, f"{b.weight:.4g} N", *lengths, f"{b.friction:.3g}")
-    return table
+        rows.append((name, f"{b.weight:.4g} N", *lengths, f"{b.friction:.3g}"))
+    return listed("blocks", ("block", "weight", "width", "height", "friction"), rows)
 
 
 def random_properties(task: BlockTask, seed: int) -> dict[str, Block]:
@@ -78,13 +77,7 @@ def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
     """
     path = Path(path)
     if path.suffix.lower() == ".json":
-        try:
-            table = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise InputError(str(path), "no such file", "identify's JSON or an actual.toml") from None
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(str(path), f"not valid JSON ({error})") from None
-        table = table.get("properties") if isinstance(table, dict) else None
+        table = read_json(path, "identify's JSON or an actual.toml").get("properties")
         if not isinstance(table, dict):
             raise InputError(f"{path}: key properties", "missing", "the JSON of identify")
     else:
@@ -142,11 +135,10 @@ class Tabletop:
     of a pile's lowest block.
     """
 
-    def __init__(self, task: BlockTask, blocks: Blocks, spots: np.ndarray) -> None:
+    def __init__(self, task: BlockTask, blocks: Blocks, spots: np.ndarray, piles: Mapping[str, int]) -> None:
         self.blocks, self.spots = blocks, spots
-        self.on = dict(task.initial)
-        self.x: dict[str, float] = {}
-        self.spot: dict[str, int] = {}
+        self.on, self.spot = dict(task.initial), dict(piles)
+        self.x = {name: float(spots[self.place(name)]) for name in task.objects}
 
     def place(self, name: str) -> int:
         """Spot of the pile that a block is in."""
@@ -202,20 +194,11 @@ def lay_out(task: BlockTask, blocks: Blocks, clearance: float, misplacement: tup
     count = _spots_needed(task)
     middle = MIDDLE + rng.uniform(-0.008, 0.008)
     spots = middle + spacing * (np.arange(count) - (count - 1) / 2)
-    orders = [rng.permutation(count) for _ in range(ORDERS)]
-    tables = [
-        _table(task, blocks, spots, dict(zip(piles, map(int, order), strict=False))) for order in orders
-    ]
+    orders = [map(int, rng.permutation(count)) for _ in range(ORDERS)]
+    tables = [Tabletop(task, blocks, spots, dict(zip(piles, order, strict=False))) for order in orders]
     table = min(tables, key=lambda t: _nudges(task, t))
     for name in task.objects:
         table.x[name] += rng.uniform(*misplacement)
-    return table
-
-
-def _table(task: BlockTask, blocks: Blocks, spots: np.ndarray, piles: dict[str, int]) -> Tabletop:
-    table = Tabletop(task, blocks, spots)
-    table.spot = piles
-    table.x = {name: float(spots[table.place(name)]) for name in task.objects}
     return table
 
 

@@ -114,15 +114,15 @@ def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray]
         square = square + (w * y**2).sum(1)
         count = count + (w > 0).sum(1)
     with np.errstate(invalid="ignore"):
-        proper = (np.linalg.cond(normal) < 1e12) & (count >= 3)
-    normal = np.where(proper[..., None, None], normal, np.eye(3))
-    solution = np.linalg.solve(normal, right[..., None])[..., 0]
+        proper = (np.linalg.cond(normal, 1) < 1e12) & (count >= 3)
+    inverse = np.linalg.inv(np.where(proper[..., None, None], normal, np.eye(3)))
+    solution = (inverse @ right[..., None])[..., 0]
     left = np.maximum(square - (solution * right).sum(-1), 0.0)
     freedom = count - 3
     fits = proper & ((freedom <= 0) | (left <= 2 * gammaincinv(np.maximum(freedom, 1) / 2, 1 - LEVEL)))
     if before + after <= 2:
         fits = proper
-    variance = np.where(proper, np.linalg.inv(normal)[..., 0, 0], np.inf)
+    variance = np.where(proper, inverse[..., 0, 0], np.inf)
     return np.stack([solution[..., 0] + samples[0], solution[..., 1] / unit, variance], -1), fits
 
 

@@ -56,22 +56,25 @@ def record(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.
     none where that is None. InputError where a tip is out of the hand's reach.
     """
     channels: dict[str, np.ndarray] = {}
+
+    def take(name: str, values: np.ndarray, quantity: str) -> None:
+        noise = 0.0 if rng is None else noise_sd(rig, quantity) * rng.standard_normal(values.shape)
+        channels[name] = values + noise
+
     for i in (1, 2):
         place, speed = position[:, i - 1], velocity[:, i - 1]
+        names, quantity = [(f"{axis}{i}", f"v{axis}{i}") for axis in "xy"], "position"
         if rig.jointed:
-            finger = rig.finger(i)
+            finger, quantity = rig.finger(i), "angle"
             require_reach(finger, i, place)
             angles = inverse(finger, i, place)
-            rates = joint_velocity(finger, angles, speed)
-            for k in (0, 1):
-                channels[f"q{i}{k + 1}"] = _noisy(angles[:, k], rig, "angle", rng)
-                channels[f"dq{i}{k + 1}"] = _noisy(rates[:, k], rig, "velocity", rng)
-        else:
-            for k, axis in enumerate("xy"):
-                channels[f"{axis}{i}"] = _noisy(place[:, k], rig, "position", rng)
-                channels[f"v{axis}{i}"] = _noisy(speed[:, k], rig, "velocity", rng)
+            place, speed = angles, joint_velocity(finger, angles, speed)
+            names = [(f"q{i}{k}", f"dq{i}{k}") for k in (1, 2)]
+        for k, (name, rate) in enumerate(names):
+            take(name, place[:, k], quantity)
+            take(rate, speed[:, k], "velocity")
         for k, axis in enumerate("xy"):
-            channels[f"f{axis}{i}"] = _noisy(force[:, i - 1, k], rig, "force", rng)
+            take(f"f{axis}{i}", force[:, i - 1, k], "force")
     order = JOINT_CHANNELS if rig.jointed else CARTESIAN_CHANNELS
     return Trial(file, t, {name: channels[name] for name in order})
 
@@ -84,10 +87,6 @@ def noise_sd(rig: Rig, quantity: str) -> float:
     if quantity == "velocity" and not rig.jointed:
         return DEFAULT_CARTESIAN_VELOCITY
     return DEFAULT_NOISE[quantity]
-
-
-def _noisy(values: np.ndarray, rig: Rig, quantity: str, rng: np.random.Generator | None) -> np.ndarray:
-    return values if rng is None else values + noise_sd(rig, quantity) * rng.standard_normal(values.shape)
 
 
 BATCH, SMALL = 16, 4  # numerics: trials integrated side by side: so many, or few

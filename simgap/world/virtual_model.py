@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 
 import jax
@@ -62,24 +62,11 @@ def physics(rig: Rig, blocks: Sequence[Block], surroundings: Surroundings | None
     """Constants of the dynamics for blocks in order; a rigid pad becomes one of RIGID_PAD."""
     around = surroundings or Surroundings()
 
-    def scalars(values: Sequence[float]) -> tuple[Array, ...]:
-        return tuple(jnp.asarray(v, float) for v in values)
-
-    pad = rig.fingertip
-    return Physics(
-        weight=scalars([b.weight for b in blocks]),
-        width=scalars([b.width for b in blocks]),
-        height=scalars([b.height for b in blocks]),
-        friction=scalars([b.friction for b in blocks]),
-        pad_normal=scalars([finite_stiffness(pad.normal_stiffness)] * 2),
-        pad_shear=scalars([finite_stiffness(pad.shear_stiffness)] * 2),
-        pad_time=jnp.asarray(around.pad_time, float),
-        support_stiffness=jnp.asarray(around.support_stiffness, float),
-        support_damping=jnp.asarray(around.support_damping, float),
-        support_friction=jnp.asarray(around.support_friction, float),
-        gravity=jnp.asarray(rig.gravity, float),
-        tilt=jnp.asarray(around.tilt, float),
-    )
+    normal, shear = map(finite_stiffness, (rig.fingertip.normal_stiffness, rig.fingertip.shear_stiffness))
+    sizes = {key: tuple(getattr(b, key) for b in blocks) for key in ("weight", "width", "height", "friction")}
+    pads = {"pad_normal": (normal, normal), "pad_shear": (shear, shear)}
+    found = Physics(**sizes, **pads, **asdict(around), gravity=rig.gravity)
+    return jax.tree.map(lambda value: jnp.asarray(value, float), found)
 
 
 def finite_stiffness(stiffness: float) -> float:

@@ -260,7 +260,7 @@ def test_descriptions(table):
         one_line(parse, table)
 
 
-SETTINGS = st.sampled_from(sorted(OperatorSettings.__dataclass_fields__))
+SETTINGS = st.sampled_from(sorted(OperatorSettings.model_fields))
 DOCUMENTS = st.one_of(
     VALUES,
     st.dictionaries(SETTINGS, VALUES, max_size=3),

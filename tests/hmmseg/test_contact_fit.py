@@ -24,11 +24,12 @@ from hmmseg.segmentation.emissions import (
     log_likelihoods,
 )
 from hmmseg.segmentation.fit import (
-    MeanShares,
     _location,
     _scale,
+    chain_of,
     fit,
     initial_parameters,
+    mean_shares,
     otsu,
 )
 
@@ -271,10 +272,10 @@ def test_pieces_without_data_keep_what_they_had():
 
 
 def test_transitions_are_probabilities_with_the_mean_duration():
-    stay, advance = MeanShares((200,), np.array([0.25, 0.5, 0.25])).chain(0).bands
+    stay, advance = chain_of(np.array([0.25, 0.5, 0.25]), 200).bands
     np.testing.assert_allclose(np.exp(stay[:2]) + np.exp(advance), 1.0)
     np.testing.assert_allclose(np.exp(-advance), [50, 100])
-    stay, advance = MeanShares((5,), np.array([1e-9, 1.0])).chain(0).bands
+    stay, advance = chain_of(np.array([1e-9, 1.0]), 5).bands
     assert np.isfinite(stay).all() and np.isfinite(advance).all()
 
 
@@ -313,7 +314,7 @@ def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():
     gammas = [g / g.sum(axis=1, keepdims=True) for g in gammas]
     counts = sum(g.mean(axis=0) for g in gammas)
     expected = stats.dirichlet(np.full(4, 1 / 4) + counts).mean()
-    found = MeanShares((30, 50), np.full(4, 0.25)).updated(gammas).shares
+    found = mean_shares(gammas)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     assert found[3] > 0
 
@@ -321,28 +322,18 @@ def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():
 STAY = 0.8
 
 
-@dataclass(frozen=True)
-class Levels:
-    """Unit-variance levels, the first known to be 0."""
+def learn_level(trials, start, **settings):
+    """EM of two unit-variance levels, the first known to be 0."""
+    chain = Chain(np.log([STAY, 1.0]), np.log([1 - STAY]))
 
-    trials: tuple[np.ndarray, ...]
-    level: float
+    def tables(level):
+        return [norm.logpdf(x[:, None], [0.0, level]) for x in trials], [chain] * len(trials)
 
-    def log_likelihoods(self, trial):
-        return norm.logpdf(self.trials[trial][:, None], [0.0, self.level])
-
-    def updated(self, responsibilities):
+    def updated(level, responsibilities):
         weight = np.concatenate([r[:, 1] for r in responsibilities])
-        return replace(self, level=float(weight @ np.concatenate(self.trials) / weight.sum()))
+        return float(weight @ np.concatenate(trials) / weight.sum())
 
-
-@dataclass(frozen=True)
-class Fixed:
-    def chain(self, trial):
-        return Chain(np.log([STAY, 1.0]), np.log([1 - STAY]))
-
-    def updated(self, responsibilities):
-        return self
+    return em(start, tables, updated, **settings)
 
 
 def by_enumeration(trials, level):
@@ -367,7 +358,7 @@ def recorded():
 
 def test_log_evidence_and_responsibilities_are_those_of_enumeration():
     trials = recorded()
-    fit = em(Levels(trials, 1.5), Fixed(), len(trials), max_iterations=1)
+    fit = learn_level(trials, 1.5, max_iterations=1)
     assert fit.log_evidence == pytest.approx(by_enumeration(trials, 1.5), abs=1e-9)
     assert (fit.num_iterations, fit.converged) == (1, False)
     x = trials[3]
@@ -376,19 +367,19 @@ def test_log_evidence_and_responsibilities_are_those_of_enumeration():
         * STAY ** (c - 1) for c in range(1, x.size)
     ])  # fmt: skip
     late = [weights[:t].sum() / weights.sum() for t in range(x.size)]
-    np.testing.assert_allclose(fit.responsibilities[3][:, 1], late, atol=1e-9)
+    np.testing.assert_allclose(fit.alignments[3].smoothed[:, 1], late, atol=1e-9)
 
 
 def test_em_ends_at_the_maximum_of_the_evidence():
     trials = recorded()
-    fit = em(Levels(trials, 0.7), Fixed(), len(trials), max_iterations=500, tolerance=1e-10)
+    fit = learn_level(trials, 0.7, max_iterations=500, tolerance=1e-10)
     assert fit.converged
     best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
-    assert fit.emission.level == pytest.approx(best.x, abs=1e-3)
-    assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.emission.level), abs=1e-9)
+    assert fit.model == pytest.approx(best.x, abs=1e-3)
+    assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.model), abs=1e-9)
 
 
 def test_a_trial_too_short_says_which_state_starves():
     with pytest.raises(InfeasibleAlignment) as error:
-        em(Levels((np.zeros(4), np.zeros(1)), 1.0), Fixed(), 2)
+        learn_level((np.zeros(4), np.zeros(1)), 1.0)
     assert error.value.subtask == 1

@@ -24,12 +24,12 @@ def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 1
                 tuple(f"c{i}" for i in range(channels)), tuple(f"p{i}" for i in range(parts)))  # fmt: skip
 
 
-def linear(name: str, jacobian: np.ndarray, scale: float = 1.0, named: bool = True) -> Candidate:
+def linear(name: str, jacobian: np.ndarray, scale: float = 1.0) -> Candidate:
     """An effect that is linear in its parameters."""
     k = jacobian.shape[1]
     nothing, far = np.zeros(k), np.full(k, np.inf)
     return Candidate(name, tuple(f"{name}{i}" for i in range(k)), nothing, nothing, np.full(k, scale),
-                     np.zeros(len(jacobian)), jacobian, -far, far, named=named)  # fmt: skip
+                     np.zeros(len(jacobian)), jacobian, -far, far)  # fmt: skip
 
 
 def gap_of(theta: dict[int, float], seed: int = 0, more: np.ndarray | float = 0.0, same: bool = False) -> Gap:
@@ -264,19 +264,6 @@ def test_what_is_below_the_tolerance_speaks_less_for_a_gap():
     other = forms(replace(gap, tolerance=np.full(gap.residual.size, 0.01)))
     assert statistic(*leniently(f, models)) < 0.5 * statistic(f, models)
     assert statistic(*leniently(other, models)) == pytest.approx(statistic(other, models))
-
-
-def test_what_has_no_name_explains_only_what_names_do_not():
-    gap = gap_of({0: 12.0, 3: 1.0}, seed=5)
-    a, b, c, d = gap.candidates
-    both = np.concatenate([a.jacobian, d.jacobian], 1)
-    anything = linear("anything", both, named=False)  # has the cause within it, and a little more
-    told = attribute(replace(gap, candidates=(a, b, c, anything)), heldout=False)
-    assert told.models[0].effects == (3,)  # more likely than the cause alone
-    assert told.verdict == "named" and told.causes == ("a",)
-    # Where names leave most of the gap it is unknown.
-    rest = attribute(replace(gap, candidates=(b, c, anything)), heldout=False)
-    assert rest.verdict == "unknown" and rest.causes == ()
 
 
 def test_an_effect_that_cannot_act_on_these_recordings_is_not_taken():

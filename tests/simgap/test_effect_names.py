@@ -4,7 +4,7 @@ import ast
 from pathlib import Path
 
 import simgap
-from simgap.effects import fitted
+from simgap.effects import catalogue
 
 ROOT = Path(simgap.__file__).parent
 # The comparison with given trials and robots have effects of their own, some of the same names.
@@ -20,7 +20,7 @@ def named_in(path: Path, names: set[str]) -> set[str]:
 
 
 def test_no_file_but_those_that_define_effects_names_one():
-    names, listed = set(fitted()), {}
+    names, listed = set(catalogue()), {}
     for path in sorted(ROOT.rglob("*.py")):
         # What an effect is taken for, and its own keys, are said where it is defined.
         own = path.parent == ROOT / "effects" and " = HandEffect(\n" in path.read_text(encoding="utf-8")

@@ -5,8 +5,8 @@ import pytest
 from jax.tree_util import tree_leaves
 
 from hmmseg.hand.kinematics import inverse
-from hmmseg.io.rig import FORCE_CHANNELS, Finger, Fingertip, Rig
-from simgap.effects import catalogue, decoys, fitted
+from hmmseg.io.rig import Finger, Fingertip, Rig
+from simgap.effects import catalogue
 from simgap.effects.base import Performance, World, flat, tips
 from simgap.gap.problem import STEP
 from simgap.gap.residuals import contact
@@ -24,7 +24,7 @@ RIG = Rig(
     },
     fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0),
 )
-DETERMINISTIC = sorted(n for n, e in fitted().items() if e.correct is not None)
+DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
 
 
 def performance(n: int = 400) -> Performance:
@@ -62,12 +62,11 @@ def world_of(p: Performance) -> World:
 
 def test_every_name_of_the_contract_is_an_effect():
     assert set(catalogue()) == {*CONTRACT.split()}
-    assert decoys() and set(fitted()) == {*decoys(), *catalogue()} and not {*decoys()} & {*catalogue()}
 
 
 @pytest.mark.parametrize("name", DETERMINISTIC)
 def test_an_effect_that_is_off_changes_nothing_and_is_finite_where_a_fit_begins(name):
-    effect, world = fitted()[name], world_of(performance())
+    effect, world = catalogue()[name], world_of(performance())
     out = effect.correct(world, {p.name: p.nominal for p in effect.parameters.values()}, 0.0)
     for before, after, field in zip(world, out, World._fields, strict=True):
         if field not in ("creep_time", "ring", "dead_band"):  # of no width they say nothing
@@ -90,22 +89,13 @@ PLANTED = {
     "viscous_drag": {"coefficient": 0.7},
     "fingertip_mass": {"mass": 0.012},
     "contact_impact": {"impulse": 0.02},
-    "force_nonlinearity": {"curve": 0.05, "gain": -0.03},
-    "gain_drift": {"rate": 0.03, "gain": -0.02},
-    "force_memory": {"share_0.1": 0.0, "share_0.4": 0.02, "share_1.6": 0.03, "share_6.4": 0.0},
-    "force_mixing": {
-        f"{to}_from_{of}": 0.02 * (k - 1) for to in FORCE_CHANNELS for k, of in enumerate(FORCE_CHANNELS)
-    },
-    "motion_load": {
-        p.name: 0.04 * (-1) ** k for k, p in enumerate(fitted()["motion_load"].parameters.values())
-    },
 }
 
 
 @pytest.mark.parametrize("name", sorted(PLANTED))
 def test_what_apply_puts_in_correct_takes_out(name):
     truth, values = performance(), PLANTED[name]
-    effect = fitted()[name]
+    effect = catalogue()[name]
     recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))
     out = effect.correct(recorded, values, 1.0)
     before = np.abs(recorded.force - world_of(truth).force).max()

@@ -11,14 +11,8 @@ from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from simgap.generic.diagnose import diagnose, gap_of, whitening
-from simgap.generic.effects import (
-    Ring,
-    fit_ring,
-    from_swing,
-    predicted,
-    ring_waves,
-    scene,
-)
+from simgap.generic.effects import predicted, scene
+from simgap.generic.ring import Ring, fit_ring, from_swing
 from simgap.generic.trials import FAST, SLOW, _sub_bands, align, bin_edges, both, layout, means, transformed
 
 
@@ -49,13 +43,11 @@ def test_white_noise_has_its_variance_in_every_coefficient():
 
 
 def test_parts_cover_a_subtask_and_follow_its_event_in_seconds(alike):
-    for k in range(3):
-        short, long = (bin_edges(alike, 1.0, 1.0 + d, k) for d in (2.0, 3.0))
-        assert (np.diff(short) > 0).all()
-        assert short[[0, -1]] == pytest.approx([1.0, 3.0])
-        assert long[[0, -1]] == pytest.approx([1.0, 4.0])
-        if alike.event[k]:
-            assert short[6] == long[6] == pytest.approx(1.0 + alike.event[k])
+    edges, first = np.array([0.0, 1.0, 3.0, 5.0]), int(alike.bins[0])
+    short, long = (bin_edges(alike, edges + np.array([0, 0, d, d])) for d in (0.0, 1.0))
+    assert short.size == alike.bins.sum() + 1 and (np.diff(short) > 0).all()
+    assert short[np.cumsum([0, *alike.bins])] == pytest.approx(edges)
+    assert short[first + 6] == long[first + 6] == pytest.approx(1.0 + alike.event[1])
     assert alike.event[0] == 0 and alike.event[1] > 0.2
 
 
@@ -231,10 +223,8 @@ def test_rates_may_differ():
     assert np.abs(found[0].mean(0) - found[1].mean(0))[top].mean() < 0.6  # averaged, not picked
 
 
-def test_rings_begin_at_their_event(alike):
-    nothing = (0.0, 0.0)
-    given = scene(alike, Ring(5.0, 0.1, 0.0, 0.0, nothing, nothing))
-    waves = ring_waves(given, np.array([-0.1, 0.0, 0.05]))
+def test_rings_begin_at_their_event():
+    waves = Ring(5.0, 0.1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0)).waves(np.array([-0.1, 0.0, 0.05]))
     np.testing.assert_allclose(waves[:, 0], 0.0)
     np.testing.assert_allclose(waves[:, 1], [0.0, 1.0])
     assert waves[0, 2] == pytest.approx(np.exp(-0.1 * 2 * np.pi * 5 * 0.05))

@@ -22,7 +22,7 @@ from simgap.simulators.mjcf.runs import (  # noqa: E402
     _carried_out,
     _commanded,
 )
-from simgap.simulators.mjcf.setting import FIELDS, Changed  # noqa: E402
+from simgap.simulators.mjcf.setting import FIELDS, changed_model  # noqa: E402
 
 XML = """<mujoco model="swing">
   <compiler angle="radian"/>
@@ -232,7 +232,7 @@ def test_a_patched_model_is_the_one_that_was_simulated(files, name):
     text, lacking = patched(paths[0], composed, {effect: {short: value}}, [effect])
     again = mujoco.MjModel.from_xml_string(text)
     assert not lacking
-    with Changed(simulator.model, simulator.settings, ((name, value),)):
+    with changed_model(simulator.model, simulator.settings, ((name, value),)):
         for field in FIELDS:
             np.testing.assert_allclose(getattr(again, field), getattr(simulator.model, field), 1e-5, 1e-9)
         np.testing.assert_allclose(again.opt.gravity, simulator.model.opt.gravity, rtol=1e-5)

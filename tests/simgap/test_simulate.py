@@ -124,7 +124,7 @@ def test_properties_come_from_the_json_of_identify(tmp_path):
 def test_what_cannot_be_performed_is_refused():
     with pytest.raises(InputError, match="'block2' is missing"):
         simulate_trial(STACK, RIG, {"block1": PAPER_BLOCKS["block1"]}, seed=0)
-    with pytest.raises(ValueError, match="operator grip"):
+    with pytest.raises(ValueError, match=r"grip\n.*expected \(low, high\), low <= high"):
         OperatorSettings(grip=(3.0, 1.0))
     short = {i: Finger(base=f.base, links=(0.08, 0.08)) for i, f in (RIG.fingers or {}).items()}
     with pytest.raises(InputError, match="finger 1"):

@@ -27,7 +27,7 @@ PAGE = Path(simgap.__file__).parents[1] / "docs" / "your_effect.md"
 @pytest.fixture
 def step(tmp_path, monkeypatch):
     (tmp_path / "step.py").write_text(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0])
-    caches = (channels.channel_effects, effects._defined, of_ensembles.effects)
+    caches = (channels.channel_effects, effects.catalogue, of_ensembles.effects)
     monkeypatch.setattr(channels, "__path__", [*channels.__path__, str(tmp_path)])
     for cache in caches:
         cache.cache_clear()

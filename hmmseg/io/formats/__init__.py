@@ -65,7 +65,12 @@ def read_table(path: str | Path, wanted: Sequence[str] | None = None) -> Table:
     file, part = split_part(path)
     kind = kind_of(file)
     with _parsing(path, "a table with a header row"):
-        return checked_width(_module(kind, path).read(file, part, wanted))
+        table = _module(kind, path).read(file, part, wanted)
+    from hmmseg.io.table import MAX_COLUMNS  # loads NumPy, which `hmmseg --help` does without
+
+    if len(table.names) > MAX_COLUMNS:
+        raise InputError(table.file, f"has {len(table.names)} columns", f"{MAX_COLUMNS} at most")
+    return table
 
 
 @contextmanager
@@ -80,15 +85,6 @@ def _parsing(path: str | Path, expected: str = "") -> Iterator[None]:
 
         problem = f"cannot be read ({shown(error) or type(error).__name__})"
         raise InputError(str(path), problem, expected) from error
-
-
-def checked_width(table: Table) -> Table:
-    """The table; InputError where it has more columns than any recording."""
-    from hmmseg.io.table import MAX_COLUMNS  # loads NumPy, which `hmmseg --help` does without
-
-    if len(table.names) > MAX_COLUMNS:
-        raise InputError(table.file, f"has {len(table.names)} columns", f"{MAX_COLUMNS} at most")
-    return table
 
 
 def rows_of(path: Path, kind: str) -> int | None:

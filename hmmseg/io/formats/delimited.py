@@ -63,43 +63,24 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     if len(frame) != layout.rows.size:
         raise InputError(str(path), f"{layout.rows.size} lines make {len(frame)} rows", "one line a row")
     kept = ~frame.isna().to_numpy().all(axis=1) if chosen else np.ones(len(frame), dtype=bool)
-    columns = {layout.names[i]: _plain(frame[i])[kept] for i in chosen}
-    rows = layout.rows[kept] + 1
-    if layout.decimal == ",":
-        _no_points(columns, rows, str(path))
-        columns = {name: _with_points(values) for name, values in columns.items()}
-    return Table(str(path), tuple(names), columns, rows, layout.units, notes=layout.notes)
-
-
-def _plain(column) -> np.ndarray:
-    values = column.to_numpy()
-    return values if isinstance(values, np.ndarray) else np.asarray(values, dtype=object)
-
-
-def _no_points(columns: dict[str, np.ndarray], rows: np.ndarray, where: str) -> None:
-    """InputError for 1.5 or 1.234,5 among decimal commas: nobody can say what it means."""
-    for name, values in columns.items():
-        if values.dtype.kind != "O":
-            continue
-        for i, cell in enumerate(values):
+    columns, rows = {layout.names[i]: np.asarray(frame[i])[kept] for i in chosen}, layout.rows[kept] + 1
+    for name, values in columns.items() if layout.decimal == "," else ():
+        for i, cell in enumerate(values if values.dtype.kind == "O" else ()):
             if isinstance(cell, str) and "." in cell and NUMBER.fullmatch(cell.replace(",", "").strip()):
-                raise InputError(f"{where}: row {rows[i]}, column {name}",
+                raise InputError(f"{path}: row {rows[i]}, column {name}",  # nobody can say what it means
                                  f"{cell} has a decimal point, others have commas", "one kind")  # fmt: skip
-
-
-def _with_points(values: np.ndarray) -> np.ndarray:
-    """Numbers with points, in columns where some cell is none: so that this cell is named, and not they."""
-    if values.dtype.kind != "O":
-        return values
-    commas = (isinstance(c, str) and COMMA_NUMBER.fullmatch(c.strip()) for c in values)
-    return np.array(
-        [c.replace(",", ".") if yes else c for c, yes in zip(values, commas, strict=True)], object
-    )
+            if isinstance(cell, str) and COMMA_NUMBER.fullmatch(cell.strip()):
+                values[i] = cell.replace(",", ".")  # so that a cell that is no number is named, and not this
+    return Table(str(path), tuple(names), columns, rows, layout.units, notes=layout.notes)
 
 
 def find_layout(path: Path) -> Layout:
     """Layout of a text file, every row checked for its number of cells."""
-    encoding = _encoding(path)
+    with path.open("rb") as file:
+        start = file.readline(MAX_LINE)
+    if len(start) == MAX_LINE:
+        raise InputError(f"{path}: row 1", f"is longer than {MAX_LINE} bytes", "a table with a header row")
+    encoding = "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
         return _layout(path, encoding)
     except UnicodeDecodeError as error:
@@ -160,8 +141,9 @@ def _layout(path: Path, encoding: str) -> Layout:
                 units = units_of(header, cells_of(text, separator)[: len(header)])
                 skipped.append(number)
                 continue
-            if decimal == "." and separator != "," and "," in text and _comma_numbers(text, separator):
-                decimal = ","
+            if decimal == "." and separator != "," and "," in text:
+                commas = any(COMMA_NUMBER.fullmatch(cell.strip()) for cell in cells_of(text, separator))
+                decimal = "," if commas else "."
             last = len(text) - max(text.rfind(each) for each in ".,; \t")
             if not line.endswith(("\n", "\r")) and len(decimals) == 1 < len(rows) and last < min(decimals):
                 notes.append(f"{path}: row {number + 1}, the last, ends within a number and is left out")
@@ -191,14 +173,6 @@ def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] |
     return None
 
 
-def _encoding(path: Path) -> str:
-    with path.open("rb") as file:
-        start = file.readline(MAX_LINE)
-    if len(start) == MAX_LINE:
-        raise InputError(f"{path}: row 1", f"is longer than {MAX_LINE} bytes", "a table with a header row")
-    return "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-
-
 def separator_of(line: str) -> str:
     """What separates the cells of a header."""
     for separator in ("\t", ";", ","):
@@ -218,10 +192,6 @@ def cells_of(line: str, separator: str) -> list[str]:
 
 def _numeric(cells: list[str]) -> bool:
     return all(NUMBER.fullmatch(cell.strip().replace(",", ".")) for cell in cells)
-
-
-def _comma_numbers(line: str, separator: str) -> bool:
-    return any(COMMA_NUMBER.fullmatch(cell.strip()) for cell in cells_of(line, separator))
 
 
 def units_of(header: list[str], cells: list[str]) -> dict[str, str]:

@@ -341,21 +341,17 @@ def _clock_of(file: str, used: Sequence[Stream]) -> tuple[bool, list[str]]:
     """
     if not all(all(stream.stamped) for stream in used):
         return False, []
-    behind = {s.topic: np.quantile(np.array(s.logged) - np.array(s.stamped), [0.05, 0.5, 0.95]) for s in used}
-    first, last = min(behind, key=lambda t: behind[t][0]), max(behind, key=lambda t: behind[t][2])
-    if behind[last][2] - behind[first][0] <= LATE:
+    late = {s.topic: np.quantile(np.array(s.logged) - np.array(s.stamped), [0.05, 0.5, 0.95]) for s in used}
+    first, last = min(late, key=lambda t: late[t][0]), max(late, key=lambda t: late[t][2])
+    if late[last][2] - late[first][0] <= LATE:
         return True, []
+    (low, one, high), (_, other, _) = late[first] / 1e9, late[last] / 1e9
+    text = (f"stamps of {first} lie {one:.4g} s behind the times of logging, those of {last} {other:.4g} s: "
+            "two clocks; the times of logging are used")  # fmt: skip
     if first == last:
-        what = (
-            f"the stamps of {first} lie {behind[first][0] / 1e9:.4g} to {behind[first][2] / 1e9:.4g} s behind"
-        )
-        return False, [
-            f"{file}: {what} the times of logging: their clock was set meanwhile; the latter are used"
-        ]
-    what = (
-        f"stamps of {first} lie {behind[first][1] / 1e9:.4g} s behind the times of logging, those of {last} "
-    )
-    return False, [f"{file}: {what}{behind[last][1] / 1e9:.4g} s: two clocks; the times of logging are used"]
+        text = (f"the stamps of {first} lie {low:.4g} to {high:.4g} s behind the times of logging: their "
+                "clock was set meanwhile; the latter are used")  # fmt: skip
+    return False, [f"{file}: {text}"]
 
 
 def interpolated(ticks: np.ndarray, times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

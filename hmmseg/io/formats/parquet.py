@@ -62,15 +62,11 @@ def _array(column: pa.ChunkedArray) -> np.ndarray:
         lengths = np.diff(np.asarray(joined.offsets)) if hasattr(joined, "offsets") else np.array([length])
         if len(joined) and (lengths == length).all():
             return values.reshape(len(joined), length)
-        return np.array([None] * len(joined), dtype=object) if not len(joined) else _ragged(joined)
+        ragged = np.empty(len(joined), dtype=object)
+        ragged[:] = [str(entry) for entry in joined.to_pylist()]
+        return ragged
     if pa.types.is_dictionary(kind):
         return _array(column.cast(kind.value_type))
     if pa.types.is_decimal(kind):
         column = column.cast(pa.float64())
     return column.to_numpy(zero_copy_only=False)
-
-
-def _ragged(joined: pa.Array) -> np.ndarray:
-    out = np.empty(len(joined), dtype=object)
-    out[:] = [str(entry) for entry in joined.to_pylist()]
-    return out

@@ -6,6 +6,7 @@ motion.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
-from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.engine import HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.play import played
 from simgap.simulators.mjcf.runs import Runs
@@ -24,7 +25,6 @@ from simgap.simulators.mjcf.setting import (
     Setting,
     most_of,
     name_of,
-    names_of,
     nothing,
     object_id,
     payload,
@@ -45,13 +45,6 @@ GAP = 0.02  # prior: of a joint's reach: the usual play
 JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 SIZE = 0.1  # prior: of a value that the model states: the usual size of what is wrong with it
 GEOMS = 4  # chosen: pairs of touching geoms, those that touch most, whose contact is offered
-HINGES = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-SAYS = {
-    "damping": "viscous friction",
-    "frictionloss": "Coulomb friction",
-    "armature": "rotor inertia",
-    "stiffness": "stiffness of a spring or cable",
-}
 
 
 def offered(
@@ -98,74 +91,69 @@ class _Catalogue:
     def driven_joints(self) -> list[int]:
         """Hinges and slides with a name that are read as joints."""
         m, read = self.model, self.simulator.joints.values()
-        moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in HINGES and name_of(m, "joint", j)]
+        moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in (HINGE, SLIDE) and name_of(m, "joint", j)]
         return [j for j in moving if j in read]
 
     def add_joints(self, joints: Sequence[int], motions: Sequence[Motion]) -> None:
-        """Damping, dry friction, rotor inertia and stiffness of joints."""
+        """Friction, rotor inertia and stiffness of joints; friction by load, speed or direction, and drag."""
         for j in joints:
             name, size = name_of(self.model, "joint", j), sizes_of(motions, j)
-            for attribute, scale in (
-                ("damping", size.torque / size.rate),
-                ("frictionloss", size.torque),
-                ("armature", size.torque / size.acceleration),
-                ("stiffness", size.torque / size.reach),
-            ):
-                setting = setting_of(self.model, f"joint:{name}.{attribute}")
-                sd = max(SHARE * scale, SIZE * abs(setting.nominal))
-                self.add(setting.name, sd, f"{SAYS[attribute]} of {name}", low=0.0)
-            self._add_laws(name, SHARE * size.torque, size.rate)
-
-    def _add_laws(self, joint: str, torque: float, rate: float) -> None:
-        """Friction by load, speed or direction, and drag, by a joint's usual lack of torque and its rate."""
-        head = f"joint:{joint}"
-        says = f"friction of {joint} in proportion to the torque transmitted"
-        self.add(f"{head}.load_friction", SHARE, says, low=0.0)
-        self.add(f"{head}.direction_friction", torque, f"friction of {joint} larger one way than the other")
-        says = f"drag on {joint} in proportion to the rate's square"
-        self.add(f"{head}.quadratic_drag", torque / rate**2, says, low=0.0)
-        says = f"friction of {joint} larger near standstill, by extra exp(-(rate / speed)^2)"
-        self.add(f"{head}.stribeck_extra", torque, says, low=0.0, effect=f"{head}.stribeck")
-        speed = replace(setting_of(self.model, f"{head}.stribeck_speed"), nominal=0.3 * rate)
-        low = 0.03 * rate
-        self.add(speed.name, 0.1 * rate, says, low, effect=f"{head}.stribeck", setting=speed)
+            head, torque, rate = f"joint:{name}", SHARE * size.torque, size.rate
+            stated = (
+                ("damping", torque / rate, "viscous friction"),
+                ("frictionloss", torque, "Coulomb friction"),
+                ("armature", torque / size.acceleration, "rotor inertia"),
+                ("stiffness", torque / size.reach, "stiffness of a spring or cable"),
+            )
+            for attribute, sd, what in stated:
+                setting = setting_of(self.model, f"{head}.{attribute}")
+                self.add(setting.name, max(sd, SIZE * abs(setting.nominal)), f"{what} of {name}", low=0.0)
+            says = f"friction of {name} in proportion to the torque transmitted"
+            self.add(f"{head}.load_friction", SHARE, says, low=0.0)
+            self.add(
+                f"{head}.direction_friction", torque, f"friction of {name} larger one way than the other"
+            )
+            says = f"drag on {name} in proportion to the rate's square"
+            self.add(f"{head}.quadratic_drag", torque / rate**2, says, low=0.0)
+            says = f"friction of {name} larger near standstill, by extra exp(-(rate / speed)^2)"
+            self.add(f"{head}.stribeck_extra", torque, says, low=0.0, effect=f"{head}.stribeck")
+            speed = replace(setting_of(self.model, f"{head}.stribeck_speed"), nominal=0.3 * rate)
+            self.add(speed.name, 0.1 * rate, says, 0.03 * rate, effect=f"{head}.stribeck", setting=speed)
 
     def add_actuators(self) -> None:
         """Gains, velocity gains and saturation of actuators that a log drives."""
-        m, driven = self.model, (self.simulator.driven or {}).values()
-        for name in names_of(m, "actuator"):
-            a = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_ACTUATOR, name)
-            if a not in driven:
-                continue
+        m = self.model
+        for a in sorted({*self.simulator.driven.values()}):
+            name, head = name_of(m, "actuator", a), f"actuator:{name_of(m, 'actuator', a)}"
             if m.actuator_gainprm[a, 0]:
                 says = f"gain of {name} (of a servo, its stiffness)"
-                self.add(f"actuator:{name}.gain", SIZE, says, low=-0.9)
+                self.add(f"{head}.gain", SIZE, says, low=-0.9)
                 sd = SIZE * abs(float(m.actuator_biasprm[a, 2]))
-                self.add(f"actuator:{name}.damping", sd, f"velocity gain of {name}", low=0.0)
+                self.add(f"{head}.damping", sd, f"velocity gain of {name}", low=0.0)
             if most_of(m, a) and int(m.actuator_trntype[a]) == JOINT:
                 says = f"{name} falls behind in proportion to its force, by this share at its most"
-                self.add(f"actuator:{name}.{FADE}", SIZE, says, low=-0.9, high=0.9)
+                self.add(f"{head}.{FADE}", SIZE, says, low=-0.9, high=0.9)
             if m.actuator_forcelimited[a]:
                 sd = SIZE * float(m.actuator_forcerange[a, 1])
-                self.add(f"actuator:{name}.limit", sd, f"saturation of {name}", low=1e-9)
+                self.add(f"{head}.limit", sd, f"saturation of {name}", low=1e-9)
 
     def add_bodies(self, joints: Sequence[int]) -> None:
-        """Mass, centre of mass, payload and link length of bodies that move."""
+        """Mass, centre of mass, payload and link length of bodies that move by themselves."""
         m = self.model
-        for b in _moved_bodies(m, [*joints, *self.simulator.free]):
+        for b in sorted({int(m.jnt_bodyid[j]) for j in (*joints, *self.simulator.free)}):
             name, mass = name_of(m, "body", b), float(m.body_mass[b])
             if not name or mass <= 0:
                 continue
             self.add(f"body:{name}.mass", SIZE * mass, f"mass (and inertia) of {name}", low=1e-3 * mass)
-            gyration = float(np.sqrt(m.body_inertia[b].sum() / mass))
+            gyration, centre = float(np.sqrt(m.body_inertia[b].sum() / mass)), f"body:{name}.com"
             for axis in "xyz":
-                centre = f"body:{name}.com"
                 self.add(f"{centre}_{axis}", SIZE * gyration, f"centre of mass of {name}", effect=centre)
-            children = [c for c in range(m.nbody) if m.body_parentid[c] == b and c != b]
-            if not any(m.body_jntnum[c] for c in children):
+            if not any(m.body_jntnum[c] for c in range(1, m.nbody) if m.body_parentid[c] == b):
                 self._add_payload(name)
             first = int(m.body_jntadr[b])
-            chained = m.body_jntnum[b] and int(m.jnt_type[first]) in HINGES and m.body_parentid[b] != 0
+            chained = (
+                m.body_jntnum[b] and int(m.jnt_type[first]) in (HINGE, SLIDE) and m.body_parentid[b] != 0
+            )
             if chained and np.linalg.norm(m.body_pos[b]) > 1e-6:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
 
@@ -179,14 +167,14 @@ class _Catalogue:
             at = np.array(stated)
         where = ", ".join(f"{1e3 * x:.0f}" for x in at)
         setting, says = payload(m, body, np.array(at)), f"a load on {body}, at {where} mm in its frame"
-        self.add(setting.name, SIZE * _largest(m), says, low=0.0, setting=setting)
+        self.add(setting.name, SIZE * float(np.max(m.body_mass[1:])), says, low=0.0, setting=setting)
 
     def add_play(
         self, joints: Sequence[int], motions: Sequence[Motion], logs: Mapping[str, Recording]
     ) -> None:
         """Play between the motors and the joints that they move."""
         m, simulator, wanted, made = self.model, self.simulator, tuple(self.settings), {}
-        for column, a in (simulator.driven or {}).items():
+        for column, a in simulator.driven.items():
             j = int(m.actuator_trnid[a, 0])
             alone = np.sum(np.asarray(m.actuator_trnid)[:, 0] == j) == 1
             if j not in joints or int(m.actuator_trntype[a]) != JOINT or not alone:
@@ -202,7 +190,7 @@ class _Catalogue:
             found = played(simulator.spec.copy(), *names, runs, wanted, logs, simulator.joints)
             if found is None:
                 continue
-            unit = "rad" if int(m.jnt_type[j]) == HINGES[0] else "m"
+            unit = "rad" if int(m.jnt_type[j]) == HINGE else "m"
             effect = f"command:{column}.backlash"
             made[found.width] = found
             sd = GAP * sizes_of(motions, j).reach
@@ -253,24 +241,13 @@ class _Catalogue:
                 self.add(name, SIZE * abs(nominal) if nominal else 0.01)
 
 
-def _largest(model: Any) -> float:
-    return float(np.max(model.body_mass[1:])) if model.nbody > 1 else 1.0
-
-
-def _moved_bodies(model: Any, joints: Sequence[int]) -> list[int]:
-    """Bodies that these joints move themselves (not through a further joint)."""
-    own = {int(model.jnt_bodyid[j]) for j in joints}
-    return [b for b in range(1, model.nbody) if b in own]
-
-
 def _touching(simulator: MjcfSimulator, recordings: Sequence[Recording]) -> list[int]:
     """Geoms that touch along the recorded motion, those of moving bodies that touch most."""
     if not simulator.touching:
         return []
-    count: dict[int, int] = {}
-    for log in recordings:
-        for g in (g for pairs in simulator.touched(log) for pair in pairs for g in pair):
-            count[g] = count.get(g, 0) + 1
+    count = Counter(
+        g for log in recordings for pairs in simulator.touched(log) for pair in pairs for g in pair
+    )
     moving = {int(simulator.model.jnt_bodyid[j]) for j in (*simulator.free, *simulator.joints.values())}
     ranked = sorted(count, key=lambda g: (int(simulator.model.geom_bodyid[g]) not in moving, -count[g]))
     return ranked[:GEOMS]

@@ -6,8 +6,18 @@ import importlib
 from collections import Counter
 from typing import Any
 
-mujoco: Any = importlib.import_module("mujoco")
-rollout: Any = importlib.import_module("mujoco.rollout")
+from hmmseg.errors import InputError
+
+try:
+    mujoco: Any = importlib.import_module("mujoco")
+    rollout: Any = importlib.import_module("mujoco.rollout")
+except ImportError:
+    raise InputError("--mjcf", "needs MuJoCo", 'pip install "hmmseg[mujoco]"') from None
+if mujoco.__version__ == "4.0.0":
+    raise InputError("--mjcf", "MuJoCo 4.0.0 has a solver bug", "another version from 3 on")
+
+FREE, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "SLIDE", "HINGE"))
+FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
 _WARNED: Counter[str] = Counter()
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.setting import FADE, OF_JOINTS, most_of, object_id
 
 MOTOR = ":motor"  # behind a joint's name: of the motor, where it is a body of its own
@@ -80,7 +80,7 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
     """Sensors (B, steps, sensors) of runs from full states (B, size) with controls (B, steps, actuators), as
     `mujoco.rollout` gives them, with laws that act."""
     out = np.empty((*control.shape[:2], model.nsensordata))
-    spec, plain = int(mujoco.mjtState.mjSTATE_FULLPHYSICS), np.array(model.dof_frictionloss)
+    plain = np.array(model.dof_frictionloss)
     step, limit, rate = mujoco.mj_step, model.dof_frictionloss, data.qvel
     motor, bias, force, pushed = data.qfrc_actuator, data.qfrc_bias, data.actuator_force, data.qfrc_applied
     extra = bool(laws.fading) or any(f.drag for f in laws.friction)
@@ -88,7 +88,7 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
         for b in range(len(first)):
             limit[:] = plain
             mujoco.mj_resetData(model, data)
-            mujoco.mj_setState(model, data, first[b], spec)
+            mujoco.mj_setState(model, data, first[b], FULL)
             data.ctrl[:] = control[b, 0]
             mujoco.mj_forward(model, data)
             data.qacc_warmstart[:] = 0.0

@@ -7,19 +7,20 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.units import UNITS, known_unit, unwrapped
 from simgap.robot_effects.base import RobotEffect
+from simgap.simulators.mjcf.catalogue import offered
+from simgap.simulators.mjcf.engine import FREE, HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
+from simgap.simulators.mjcf.model import MjcfSimulator
+from simgap.simulators.mjcf.setting import compiled, name_of, names_of, object_id, setting_of
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
-
-if TYPE_CHECKING:
-    from simgap.simulators.mjcf.model import MjcfSimulator
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ class Loaded:
         for name, mapped in columns.items():
             if mapped.kind == "command":  # a drive holds it until the next
                 values[name] = held(values[name])
-            elif mapped.thing == "joint" and mapped.kind == "position" and self.turns(mapped.name):
+            elif (
+                mapped.thing == "joint" and mapped.kind == "position" and _turns(self.simulator.model, mapped)
+            ):
                 wrapped, values[name] = values[name], unwrapped(values[name])
                 if not np.array_equal(wrapped, values[name], equal_nan=True):
                     warnings.append(f"{path}: column {name} jumps by whole turns, which were taken out")
@@ -57,17 +60,8 @@ class Loaded:
         warnings += _clipped(self.simulator, log, str(path))
         return replace(log, warnings=tuple(warnings))
 
-    def turns(self, joint: str) -> bool:
-        """Whether a joint is a hinge, whose angle may be recorded with jumps by whole turns."""
-        from simgap.simulators.mjcf.engine import mujoco
-
-        kind = self.simulator.model.joint(joint).type.item()
-        return kind == int(mujoco.mjtJoint.mjJNT_HINGE)
-
     def effects(self, recordings: Sequence[Recording]) -> list[RobotEffect]:
         """Candidates that need the model: those it can set become its parameters, the rest are given."""
-        from simgap.simulators.mjcf.catalogue import offered
-
         return offered(self.simulator, recordings, self.candidates)
 
 
@@ -83,15 +77,8 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
         The simulator, and how logs are read for it.
 
     Raises:
-        InputError: MuJoCo is missing or does not read the model, or the map or a candidate names what the
-            model does not have.
+        InputError: MuJoCo does not read the model, or the map or a candidate names what it does not have.
     """
-    try:
-        from simgap.simulators.mjcf.engine import mujoco
-    except ImportError:
-        raise InputError("--mjcf", "needs MuJoCo", 'pip install "hmmseg[mujoco]"') from None
-    if mujoco.__version__ == "4.0.0":
-        raise InputError("--mjcf", "MuJoCo 4.0.0 has a solver bug", "another version from 3 on")
     if not xml.is_file():
         raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
     if xml.suffix.lower() == ".mjb":
@@ -105,7 +92,6 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     if not SHORTEST <= plain.opt.timestep <= 1.0:
         raise InputError(f"--mjcf {xml}: option timestep", f"found {plain.opt.timestep:g} s",
                          f"from {SHORTEST:g} to 1 s")  # fmt: skip
-    from simgap.simulators.mjcf.setting import compiled, names_of, setting_of
 
     def check(key: str, kind: str, name: str, known: Sequence[str]) -> None:
         if name not in known:
@@ -121,13 +107,13 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
         check(f"payload_at.{body}", "body", body, names_of(plain, "body"))
         if isinstance(place, str):
             check(f"payload_at.{body}", "site", place, names_of(plain, "site"))
-    address = _add_sensors(mujoco, spec, described.columns)
+    address = _add_sensors(spec, described.columns)
     for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
         if hasattr(body, "simple"):
             body.simple = False
     model = compiled(spec)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    simulator, warnings = _simulator(mujoco, model, described, address)
+    simulator, warnings = _simulator(model, described, address)
     simulator.spec = spec
     whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, whole)
@@ -148,7 +134,7 @@ READ = {
 }
 
 
-def _add_sensors(mujoco: Any, spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[str, int]]:
+def _add_sensors(spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[str, int]]:
     """A sensor for each compared column: column -> (sensor's name, component)."""
     out: dict[str, tuple[str, int]] = {}
     for column, m in columns.items():
@@ -172,16 +158,13 @@ def _add_sensors(mujoco: Any, spec: Any, columns: Mapping[str, Mapped]) -> dict[
 
 
 def _simulator(
-    mujoco: Any, model: Any, described: Map, address: Mapping[str, tuple[str, int]]
+    model: Any, described: Map, address: Mapping[str, tuple[str, int]]
 ) -> tuple[MjcfSimulator, list[str]]:
     """The simulator of a model and its map, without parameters; what its columns leave open."""
-    from simgap.simulators.mjcf.model import MjcfSimulator
-    from simgap.simulators.mjcf.setting import name_of, object_id
-
-    file, kinds = described.file, mujoco.mjtJoint
+    file = described.file
     channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
     for column, m in described.columns.items():
-        unit = _unit(mujoco, model, m)
+        unit = _unit(model, m)
         _check_unit(f"{file}: columns.{column}.unit", m, unit)
         channels[column] = Channel(unit, m.kind, m.sd)
         if m.kind == "command":
@@ -194,7 +177,7 @@ def _simulator(
         sensors[column] = int(model.sensor_adr[number]) + at
         if m.thing == "joint" and m.kind == "position":
             joints[column] = object_id(model, "joint", m.name)
-            if int(model.jnt_type[joints[column]]) not in (int(kinds.mjJNT_HINGE), int(kinds.mjJNT_SLIDE)):
+            if int(model.jnt_type[joints[column]]) not in (HINGE, SLIDE):
                 raise InputError(f"{file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
                                  "the seven columns of its body's pose")  # fmt: skip
         if m.thing == "body":
@@ -202,16 +185,14 @@ def _simulator(
     free = {}
     for name, pose in poses.items():
         first = int(model.body_jntadr[object_id(model, "body", name)])
-        if first < 0 or int(model.jnt_type[first]) != int(kinds.mjJNT_FREE):
+        if first < 0 or int(model.jnt_type[first]) != FREE:
             continue
-        missing = [a for a in POSE if a not in pose]
-        if missing:
-            warnings.append(
-                f"{file}: the free body {name} has no column for {', '.join(missing)}, so that "
-                "it starts as the model has it"
-            )
-        else:
+        if len(pose) == len(POSE):
             free[first] = pose
+        else:
+            missing = ", ".join(a for a in POSE if a not in pose)
+            warnings.append(f"{file}: the free body {name} has no column for {missing}, so that it starts as "
+                            "the model has it")  # fmt: skip
     idle = [i for i in range(model.nu) if i not in driven.values()]
     if idle:
         names = ", ".join(name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
@@ -224,14 +205,18 @@ def _simulator(
     return made, warnings
 
 
-def _unit(mujoco: Any, model: Any, m: Mapped) -> str:
+def _turns(model: Any, m: Mapped) -> bool:
+    """Whether a column is of a hinge, whose angle may be recorded with jumps by whole turns."""
+    return m.thing == "joint" and int(model.joint(m.name).type.item()) == HINGE
+
+
+def _unit(model: Any, m: Mapped) -> str:
     """The SI unit of a column as the model has it."""
     if m.kind == "command":
         return "1" if m.unit is None else str(m.unit)
     if m.thing in ("body", "site"):
         return "1" if m.axis.startswith("q") else "m"
-    turns = m.thing == "joint" and int(model.joint(m.name).type.item()) == int(mujoco.mjtJoint.mjJNT_HINGE)
-    return READ[m.thing, m.kind][1 if turns else 2]
+    return READ[m.thing, m.kind][1 if _turns(model, m) else 2]
 
 
 def _check_unit(where: str, m: Mapped, si: str) -> None:
@@ -251,32 +236,25 @@ FULL_TURNS = (-math.tau * 4, math.tau * 4)  # limit: rad; the range of a joint t
 
 def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
     """InputError where angles are so large that they must be degrees, never guessed."""
-    from simgap.simulators.mjcf.engine import mujoco
-
     for column, m in columns.items():
         if m.thing != "joint" or m.kind != "position":
             continue
-        joint = model.joint(m.name).id
-        turning = int(model.jnt_type[joint]) == int(mujoco.mjtJoint.mjJNT_HINGE)
-        values = log[column]
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        joint, low, high = model.joint(m.name).id, np.nanmin(log[column]), np.nanmax(log[column])
         least, most = (float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else FULL_TURNS
         slack = LATITUDE * (most - least)
         if not (least - slack <= low and high <= most + slack):
-            unit, guess = ("rad", "deg") if turning else ("m", "mm")
+            unit, guess = ("rad", "deg") if _turns(model, m) else ("m", "mm")
             found = f"{low:.4g} to {high:.4g} {unit}, beyond joint {m.name}'s {least:.4g} to {most:.4g}"
             raise InputError(f"{file}: column {column}", found, f'unit = "{guess}" in the map?')
 
 
 def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
     """InputError where a servo's goals are its joint's angles in other units, never guessed."""
-    from simgap.simulators.mjcf.engine import mujoco
-
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
         joint = int(model.actuator_trnid[a, 0])
         servo = model.actuator_biasprm[a, 1] < 0 and joint in seen
-        if not servo or int(model.jnt_type[joint]) != int(mujoco.mjtJoint.mjJNT_HINGE):
+        if not servo or int(model.jnt_type[joint]) != HINGE:
             continue
         goal, angle = log[column], log[seen[joint]]
         both = np.isfinite(goal) & np.isfinite(angle)
@@ -288,9 +266,8 @@ def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
                 ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} rad"
                 there = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} rad"
                 found = f"{ends}, and its joint is at {there} of column {seen[joint]}"
-                raise InputError(
-                    f"{file}: column {column}", found, f'unit = "{unit}" of {column} in the map?'
-                )
+                mend = f'unit = "{unit}" of {column} in the map?'
+                raise InputError(f"{file}: column {column}", found, mend)
 
 
 SAME = math.log(2.0)  # limit: a servo that follows its goals at less or more than this factor follows none
@@ -300,15 +277,13 @@ def _clipped(simulator: MjcfSimulator, log: Recording, file: str) -> list[str]:
     """The warning about commands that the model clips."""
     model, out = simulator.model, []
     for column, a in simulator.driven.items():
-        if model.actuator_ctrllimited[a]:
-            low, high = (float(v) for v in model.actuator_ctrlrange[a])
-            share = float(np.mean((log[column] < low) | (log[column] > high)))
-            if share > 0:
-                ends = f"{np.nanmin(log[column]):.4g} to {np.nanmax(log[column]):.4g}"
-                out.append(
-                    f"{file}: column {column} goes from {ends}, beyond its actuator's ctrlrange {low:.4g} to "
-                    f"{high:.4g}, where the model clips it ({100 * share:.2g} % of samples)"
-                )
+        low, high = model.actuator_ctrlrange[a] if model.actuator_ctrllimited[a] else (-np.inf, np.inf)
+        share = float(np.mean((log[column] < low) | (log[column] > high)))
+        if share > 0:
+            ends = f"{np.nanmin(log[column]):.4g} to {np.nanmax(log[column]):.4g}"
+            out.append(f"{file}: column {column} goes from {ends}, beyond its actuator's ctrlrange {low:.4g} "
+                       f"to {high:.4g}, where the model clips it ({100 * share:.2g} % of samples)"
+                       )  # fmt: skip
     return out
 
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from hmmseg.robust import bridged
 from simgap.latest import latest
-from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
-from simgap.simulators.mjcf.runs import ACTS, Held, Runs, body_rate
-from simgap.simulators.mjcf.setting import HOLD, LATE, Changed, Setting, object_id
+from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
+from simgap.simulators.mjcf.setting import HOLD, LATE, Setting, changed_model, name_of, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
@@ -53,8 +53,6 @@ class MjcfSimulator:
 
     def __post_init__(self) -> None:
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
-        self._spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        self._size = mujoco.mj_stateSize(self.model, self._spec)
         self._runs_of = Runs(self.model, self._data, self.channels, self.sensor, self.driven, self.free)
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
@@ -89,7 +87,7 @@ class MjcfSimulator:
         """Every job's channels with some settings changed."""
         if plays := [n for n, _ in changed if n in self.played]:
             return self.played[plays[0]](jobs, self._states(jobs), changed, self.model)
-        with Changed(self.model, self.settings, changed):
+        with changed_model(self.model, self.settings, changed):
             return self._runs_of([j.recording for j in jobs], self._states(jobs), changed)
 
     def _states(self, jobs: Sequence[Job]) -> np.ndarray:
@@ -134,12 +132,12 @@ class MjcfSimulator:
 
     def _reset(self) -> np.ndarray:
         """The model's own state, or its keyframe's."""
-        data, state = self._data[0], np.empty(self._size)
+        data, state = self._data[0], np.empty(mujoco.mj_stateSize(self.model, FULL))
         if self.map.keyframe is None:
             mujoco.mj_resetData(self.model, data)
         else:
             mujoco.mj_resetDataKeyframe(self.model, data, object_id(self.model, "key", self.map.keyframe))
-        mujoco.mj_getState(self.model, data, state, int(self._spec))
+        mujoco.mj_getState(self.model, data, state, FULL)
         state[0] = 0.0
         return state
 
@@ -180,17 +178,7 @@ class MjcfSimulator:
             return
         for log in recordings:
             first = self._state(Job({}, log, None))
-            h = float(self.model.opt.timestep)
-            times = np.arange(int(np.ceil((log.t[-1] - log.t[0]) / h)) + 2) * h
-            held = Held(log.t - log.t[0], times)
-            control = np.zeros((1, times.size, max(self.model.nu, 1)))
-            for column, actuator in self.driven.items():
-                control[0, :, actuator] = held(log[column])
-            states, _ = rollout.rollout(
-                self.model, self._data[0], first[None], control if self.model.nu else None, nstep=times.size
-            )
-            rows = np.clip(np.searchsorted(times, log.t - log.t[0]) - 1, 0, times.size - 1)
-            found = states[0][rows]
+            found = free_run(self.model, self._data[0], log, first, self.driven)
             found[0] = first
             found[:, 0] = 0.0
             self._runs[log.name] = np.where(np.isfinite(found), found, first)
@@ -224,7 +212,7 @@ class MjcfSimulator:
 
         def made() -> list[frozenset[tuple[int, int]]]:
             data = self._data[0]
-            mujoco.mj_setState(self.model, data, self._reset(), int(self._spec))
+            mujoco.mj_setState(self.model, data, self._reset(), FULL)
             return touching_pairs(self.model, data, poses, at)
 
         return latest(self._touched, (poses.shape, poses.tobytes()), made)
@@ -258,30 +246,25 @@ def contact_labels(model: Any, t: np.ndarray, touched: Sequence[Pairs]) -> list[
 def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
     """What touches at times t, with gaps below BROKEN filled. A touch counts however brief it is, for an
     impact is brief."""
-    out = [set(s) for s in sets]
+    out = list(sets)
     for pair in frozenset().union(*sets):
         rows = [i for i, s in enumerate(sets) if pair in s]
         for a, b in itertools.pairwise(rows):
             if t[b] - t[a] <= BROKEN:
-                for i in range(a, b):
-                    out[i].add(pair)
-    return [frozenset(s) for s in out]
+                out[a:b] = [s | {pair} for s in out[a:b]]
+    return out
 
 
-def _pair(model: Any, one: int, other: int) -> str:
-    """What moves, on what it touches; geoms of the world go last."""
-    return " on ".join(_name(model, g) for g in sorted((one, other), key=lambda g: _order(model, g)))
-
-
-def _order(model: Any, geom: int) -> tuple[bool, str]:
-    return int(model.geom_bodyid[geom]) == 0, _name(model, geom)
-
-
-def _name(model: Any, geom: int) -> str:
-    """The name of a geom's body; of the world's geoms, their own."""
-    body = int(model.geom_bodyid[geom])
-    kind, number = (mujoco.mjtObj.mjOBJ_BODY, body) if body else (mujoco.mjtObj.mjOBJ_GEOM, geom)
-    return mujoco.mj_id2name(model, kind, number) or (f"body {body}" if body else GROUND)
+def _pair(model: Any, *geoms: int) -> str:
+    """What moves, on what it touches: names of geoms' bodies, then those of the world's geoms."""
+    named = []
+    for geom in geoms:
+        body = int(model.geom_bodyid[geom])
+        own = (
+            name_of(model, "body", body) or f"body {body}" if body else name_of(model, "geom", geom) or GROUND
+        )
+        named.append((body == 0, own))
+    return " on ".join(name for _, name in sorted(named))
 
 
 def touching_pairs(

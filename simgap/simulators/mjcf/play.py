@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from simgap.latest import latest
-from simgap.simulators.mjcf.engine import mujoco, rollout
+from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.laws import MOTOR
-from simgap.simulators.mjcf.runs import Held, Runs
-from simgap.simulators.mjcf.setting import Changed, Setting, compiled, setting_of
+from simgap.simulators.mjcf.runs import Runs, free_run
+from simgap.simulators.mjcf.setting import Setting, changed_model, compiled, setting_of
 from simgap.simulators.protocol import Channels, Job
 from simgap.simulators.recording import Recording
 
@@ -53,7 +53,7 @@ class Played:
         self.model.tendon_range[tendon] = (-0.5 * width, 0.5 * width)
         rest = tuple((n, x) for n, x in changed if n != self.width and n in self.settings)
         ahead = {n: self._ahead(self.logs[n], width) for n in {j.recording.name for j in jobs}}
-        with Changed(self.model, self.settings, rest):
+        with changed_model(self.model, self.settings, rest):
             more = np.array([ahead[j.recording.name][j.recording.first] for j in jobs])
             at, rate = first[:, [1 + q]] + more[:, :1], first[:, [1 + nq + v]] + more[:, 1:]
             parts = np.split(first, [1 + nq, 1 + nq + nv], 1)
@@ -73,17 +73,10 @@ class Played:
         pair = [int(m.joint(n).id) for n in (f"{self.name}{MOTOR}", self.name)]
         q, v = ([int(places[j]) for j in pair] for places in (m.jnt_qposadr, m.jnt_dofadr))
         data.qpos[q[0]] = data.qpos[q[1]]
-        spec = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        first = np.empty(mujoco.mj_stateSize(m, spec))
-        mujoco.mj_getState(m, data, first, spec)
-        since, step = log.t - log.t[0], float(m.opt.timestep)
-        times = np.arange(int(np.ceil(since[-1] / step)) + 2) * step
-        control, held = np.zeros((1, times.size, m.nu)), Held(since, times)
-        for column, actuator in self.runs.driven.items():
-            control[0, :, actuator] = held(log[column])
-        state = rollout.rollout(m, data, first[None], control, nstep=times.size)[0][0]
-        at = np.clip(np.searchsorted(times, since) - 1, 0, times.size - 1)
-        ahead = state[at][:, [1 + q[0], 1 + m.nq + v[0]]] - state[at][:, [1 + q[1], 1 + m.nq + v[1]]]
+        first = np.empty(mujoco.mj_stateSize(m, FULL))
+        mujoco.mj_getState(m, data, first, FULL)
+        state = free_run(m, data, log, first, self.runs.driven)
+        ahead = state[:, [1 + q[0], 1 + m.nq + v[0]]] - state[:, [1 + q[1], 1 + m.nq + v[1]]]
         ahead[:, 0] = np.clip(ahead[:, 0], -0.5 * width, 0.5 * width)
         return np.where(np.isfinite(ahead).all(1, keepdims=True), ahead, 0.0)
 

@@ -77,6 +77,18 @@ class Between:
         return np.where(self.inner, p1 + 0.5 * bend, p1 + s * (p2 - p1))
 
 
+def free_run(model: Any, data: Any, log: Recording, first: np.ndarray, driven: Mapping[str, int]
+             ) -> np.ndarray:  # fmt: skip
+    """Full states (num_timesteps, size) at a log's samples, of a run along all of it from `first` (size,)."""
+    since, step = log.t - log.t[0], float(model.opt.timestep)
+    times = np.arange(int(np.ceil(since[-1] / step)) + 2) * step
+    control, held = np.zeros((1, times.size, model.nu)), Held(since, times)
+    for column, actuator in driven.items():
+        control[0, :, actuator] = held(log[column])
+    states = rollout.rollout(model, data, first[None], control if model.nu else None, nstep=times.size)[0][0]
+    return states[np.clip(np.searchsorted(times, since) - 1, 0, times.size - 1)]
+
+
 @dataclass(frozen=True)
 class Side:
     """Windows of as many samples, side by side: how their commands are held and their sensors read."""

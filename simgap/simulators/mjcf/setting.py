@@ -6,14 +6,15 @@ a law that MuJoCo lacks (`laws.py`), or of how commands are held between samples
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.engine import FREE, HINGE, mujoco
 
 Put = Callable[[Any, float], None]
 OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
@@ -104,6 +105,12 @@ def _to(array: str, at: Any, factor: float | np.ndarray = 1.0) -> Put:
     return put
 
 
+def _field(name: str, unit: str, model: Any, array: str, at: Any, derived: bool = False) -> Setting:
+    """Entries of one of the model's arrays, which are alike."""
+    nominal = float(np.ravel(getattr(model, array)[at])[0])
+    return Setting(name, unit, nominal, _to(array, at), derived)
+
+
 def _larger(model: Any, *entries: tuple[str, Any]) -> Put:
     """Set entries to 1 + value times what they are in the model."""
     own = [(array, at, np.array(getattr(model, array)[at])) for array, at in entries]
@@ -117,7 +124,7 @@ def _larger(model: Any, *entries: tuple[str, Any]) -> Put:
 
 def _joint(model: Any, name: str, attribute: str) -> Setting | None:
     j = object_id(model, "joint", name)
-    turning = int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_HINGE)
+    turning = int(model.jnt_type[j]) == HINGE
     force, way = ("N m", "rad") if turning else ("N", "m")
     laws = dict(zip(OF_JOINTS, ("1", force, force, f"{way}/s", f"{force} s^2/{way}^2"), strict=True))
     if attribute in laws:
@@ -133,8 +140,7 @@ def _joint(model: Any, name: str, attribute: str) -> Setting | None:
     if found is None:
         return None
     array, at, unit = found
-    nominal = float(getattr(model, array)[at[0]])
-    return Setting(f"joint:{name}.{attribute}", unit, nominal, _to(array, at), attribute == "armature")
+    return _field(f"joint:{name}.{attribute}", unit, model, array, at, attribute == "armature")
 
 
 def _body(model: Any, name: str, attribute: str) -> Setting | None:
@@ -149,8 +155,7 @@ def _body(model: Any, name: str, attribute: str) -> Setting | None:
 
         return Setting(whole, "kg", mass, put, True)
     if attribute in ("com_x", "com_y", "com_z"):
-        k = "xyz".index(attribute[-1])
-        return Setting(whole, "m", float(model.body_ipos[b, k]), _to("body_ipos", (b, k)), True)
+        return _field(whole, "m", model, "body_ipos", (b, "xyz".index(attribute[-1])), True)
     if attribute == "length" and np.any(model.body_pos[b]):
         return Setting(whole, "1", 0.0, _larger(model, ("body_pos", b)), True)
     return None
@@ -159,11 +164,8 @@ def _body(model: Any, name: str, attribute: str) -> Setting | None:
 def payload(model: Any, name: str, place: np.ndarray) -> Setting:
     """The mass [kg] of a point load on a body, at a place (3,) [m] in its frame."""
     b = object_id(model, "body", name)
-    mass, inertia, com = (
-        float(model.body_mass[b]),
-        np.array(model.body_inertia[b]),
-        np.array(model.body_ipos[b]),
-    )
+    mass, inertia = float(model.body_mass[b]), np.array(model.body_inertia[b])
+    com = np.array(model.body_ipos[b])
 
     def load(m: Any, value: float) -> None:
         total = mass + value
@@ -180,8 +182,7 @@ def payload(model: Any, name: str, place: np.ndarray) -> Setting:
 def _geom(model: Any, name: str, attribute: str) -> Setting | None:
     g, whole = object_id(model, "geom", name), f"geom:{name}.{attribute}"
     if attribute == "size" and int(model.geom_type[g]) != int(mujoco.mjtGeom.mjGEOM_MESH):
-        put = _larger(model, ("geom_size", g), ("geom_rbound", g))
-        return Setting(whole, "1", 0.0, put)
+        return Setting(whole, "1", 0.0, _larger(model, ("geom_size", g), ("geom_rbound", g)))
     found = {
         "friction": ("friction", 0, "1"),
         "torsional": ("friction", 1, "m"),
@@ -192,25 +193,22 @@ def _geom(model: Any, name: str, attribute: str) -> Setting | None:
     if found is None:
         return None
     key, k, unit = found
-    array = f"geom_{key}"
-    return Setting(whole, unit, float(getattr(model, array)[g, k]), _to(array, (g, k)))
+    return _field(whole, unit, model, f"geom_{key}", (g, k))
 
 
 def _actuator(model: Any, name: str, attribute: str) -> Setting | None:
     a, whole = object_id(model, "actuator", name), f"actuator:{name}.{attribute}"
     if attribute == "gain":  # of a position servo its stiffness
-        put = _larger(model, ("actuator_gainprm", (a, 0)), ("actuator_biasprm", (a, 1)))
-        return Setting(whole, "1", 0.0, put)
+        entries = ("actuator_gainprm", (a, 0)), ("actuator_biasprm", (a, 1))
+        return Setting(whole, "1", 0.0, _larger(model, *entries))
     if attribute == "damping":
-        put = _to("actuator_biasprm", (a, 2), -1.0)
         nominal = -float(model.actuator_biasprm[a, 2])
-        return Setting(whole, "N m s/rad", nominal, put)
+        return Setting(whole, "N m s/rad", nominal, _to("actuator_biasprm", (a, 2), -1.0))
     if attribute == FADE and most_of(model, a):
         return Setting(whole, "1", 0.0, nothing, stored=False)
     if attribute == "limit" and model.actuator_forcelimited[a]:
-        put = _to("actuator_forcerange", a, np.array([-1.0, 1.0]))
-        nominal = float(model.actuator_forcerange[a, 1])
-        return Setting(whole, "N", nominal, put)
+        ends = _to("actuator_forcerange", a, np.array([-1.0, 1.0]))
+        return Setting(whole, "N", float(model.actuator_forcerange[a, 1]), ends)
     return None
 
 
@@ -245,7 +243,7 @@ def _drive(model: Any, _: str, attribute: str) -> Setting | None:
     are not free."""
     roots = np.asarray(model.body_rootid)
     first = np.asarray(model.body_jntadr)[roots]
-    free = np.array([j >= 0 and int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_FREE) for j in first])
+    free = np.array([j >= 0 and int(model.jnt_type[j]) == FREE for j in first])
     held, own = np.flatnonzero(~free), np.array(model.body_gravcomp)
 
     def put(m: Any, value: float) -> None:
@@ -305,35 +303,26 @@ FIELDS = (
 )  # all that settings set
 
 
-class Changed:
-    """The model with some settings changed, for as long as it is entered."""
-
-    def __init__(
-        self, model: Any, settings: Mapping[str, Setting], changed: Sequence[tuple[str, float]]
-    ) -> None:
-        self.model = model
-        self.changed = [(settings[name], value) for name, value in changed]
-
-    def __enter__(self) -> None:
-        if not self.changed:
-            return
-        self.kept = {n: np.array(getattr(self.model, n)) for n in FIELDS}
-        opt = self.model.opt
-        self.options = (np.array(opt.gravity), opt.timestep, opt.iterations)
-        for setting, value in self.changed:
-            setting.put(self.model, value)
-        self._derive()
-
-    def __exit__(self, *exception: object) -> None:
-        if not self.changed:
-            return
-        for name, values in self.kept.items():
-            getattr(self.model, name)[:] = values
-        opt = self.model.opt
-        opt.gravity[:], opt.timestep, opt.iterations = self.options
-        self._derive()
-
-    def _derive(self) -> None:
-        """Recompute the constants that depend on what is set."""
-        if any(setting.derived for setting, _ in self.changed):
-            mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+@contextmanager
+def changed_model(
+    model: Any, settings: Mapping[str, Setting], values: Sequence[tuple[str, float]]
+) -> Iterator[None]:
+    """Within it the model has some settings changed."""
+    if not values:
+        yield
+        return
+    kept, opt = {name: np.array(getattr(model, name)) for name in FIELDS}, model.opt
+    options = np.array(opt.gravity), opt.timestep, opt.iterations
+    derived = any(settings[name].derived for name, _ in values)
+    try:
+        for name, value in values:
+            settings[name].put(model, value)
+        if derived:  # what depends on it is computed anew
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+        yield
+    finally:
+        for name, own in kept.items():
+            getattr(model, name)[:] = own
+        opt.gravity[:], opt.timestep, opt.iterations = options
+        if derived:
+            mujoco.mj_setConst(model, mujoco.MjData(model))

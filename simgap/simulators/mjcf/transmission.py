@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -37,7 +37,9 @@ def elasticity(
         return []
     moved = {log.name: {n: np.zeros((len(joints), len(log))) for n in seen} for log in recordings}
     jacobian = np.zeros((3, model.nv))
+    dof = {j: int(model.jnt_dofadr[j]) for j in joints}
     for log, motion in zip(recordings, motions, strict=True):
+        geared = {j: motion.torque[j] - _of_motor(model, motion, j) for j in joints}
         for i in range(len(log)):
             for j, position in motion.position.items():
                 data.qpos[int(model.jnt_qposadr[j])] = position[i]
@@ -47,10 +49,7 @@ def elasticity(
                 of = mujoco.mj_jacSite if mapped.thing == "site" else mujoco.mj_jacBody
                 of(model, data, jacobian, None, object_id(model, mapped.thing, mapped.name))
                 rate = jacobian["xyz".index(mapped.axis)]
-                moved[log.name][name][:, i] = [
-                    rate[int(model.jnt_dofadr[j])] * (motion.torque[j][i] - _of_motor(model, motion, j, i))
-                    for j in joints
-                ]
+                moved[log.name][name][:, i] = [rate[dof[j]] * geared[j][i] for j in joints]
     out = []
     for k, j in enumerate(joints):
         if all(np.abs(moved[log.name][n][k]).max() < LIGHT for log in recordings for n in seen):
@@ -68,30 +67,30 @@ def elasticity(
     return out
 
 
-def _of_motor(model: Any, motion: Motion, joint: int, row: int) -> float:
-    """Torque that a joint's own rotor and damping take [N m], before what it moves."""
+def _of_motor(model: Any, motion: Motion, joint: int) -> np.ndarray:
+    """Torque (n,) that a joint's own rotor and damping take [N m], before what it moves."""
     dof = int(model.jnt_dofadr[joint])
-    rotor, damping = float(model.dof_armature[dof]), float(model.dof_damping[dof])
-    return rotor * float(motion.acceleration[joint][row]) + damping * float(motion.rate[joint][row])
+    return model.dof_armature[dof] * motion.acceleration[joint] + model.dof_damping[dof] * motion.rate[joint]
 
 
-class Sizes:
+class Sizes(NamedTuple):
     """What a joint shows along the logs, root mean squares."""
 
-    def __init__(self, torque: float, rate: float, acceleration: float, reach: float) -> None:
-        self.torque, self.rate = max(torque, 1e-9), max(rate, 1e-6)
-        self.acceleration, self.reach = max(acceleration, 1e-6), max(reach, 1e-6)
+    torque: float
+    rate: float
+    acceleration: float
+    reach: float
 
 
 def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
     """Sizes of one joint's motion along all logs."""
-    rms = lambda values: float(np.sqrt(np.mean(np.concatenate(values) ** 2)))  # noqa: E731
-    return Sizes(
-        rms([m.torque[joint] for m in motions]),
-        rms([m.rate[joint] for m in motions]),
-        rms([m.acceleration[joint] for m in motions]),
-        rms([m.position[joint] - m.position[joint].mean() for m in motions]),
-    )
+
+    def rms(values: Iterable[np.ndarray], least: float = 1e-6) -> float:
+        return max(float(np.sqrt(np.mean(np.concatenate([*values]) ** 2))), least)
+
+    reach = rms(m.position[joint] - m.position[joint].mean() for m in motions)
+    rate, acceleration = rms(m.rate[joint] for m in motions), rms(m.acceleration[joint] for m in motions)
+    return Sizes(rms((m.torque[joint] for m in motions), 1e-9), rate, acceleration, reach)
 
 
 SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic

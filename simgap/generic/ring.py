@@ -1,0 +1,154 @@
+"""A structure that rings after an event: found in recorded trials, without a model of it.
+
+y(t) = parabola + exp(-damping w t) (A sin w t + B cos w t) from the largest swing on, w = 2 pi f; A, B and
+the parabola of every trial its own, f and damping common. For given f and damping that is linear least
+squares (variable projection: Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973); the two are searched on a
+grid and refined. Intervals from the scatter between trials (jackknife), which needs no noise model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import stdtrit
+
+from simgap.generic.trials import Cut, Layout, resampled, windowed
+
+LEAST = 4  # numerics: coefficients that a mean power is taken of
+DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: where searches start
+LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: damping below or beyond which it is no ring
+FREQUENCIES = 80  # numerics: where searches start
+SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for
+SHORTEST = 12  # numerics: samples of a window in which an oscillation is looked for
+PERIODS = 1.5  # chosen: of the slowest oscillation looked for that a window holds
+HIGHEST = 0.4  # chosen: of the sampling rate
+RINGS = 0.2  # chosen: share of the square after an event that an oscillation must explain
+
+
+@dataclass(frozen=True)
+class Ring:
+    """`frequency` [Hz] and `damping` (ratio to critical) with standard errors and 90 % intervals."""
+
+    frequency: float
+    damping: float
+    frequency_sd: float
+    damping_sd: float
+    frequency_90: tuple[float, float]
+    damping_90: tuple[float, float]
+
+    def waves(self, t: np.ndarray) -> np.ndarray:
+        """Its sine and cosine (2, n) at times [s] since its event; 0 before."""
+        omega, since = 2 * np.pi * self.frequency, np.maximum(t, 0.0)
+        decay = np.where(t >= 0, np.exp(-self.damping * omega * since), 0.0)
+        return decay * np.array([np.sin(omega * since), np.cos(omega * since)])
+
+
+def find_ring(lay: Layout) -> Ring | None:
+    """The strongest oscillation after an event in the real trials, where they hold more power than the
+    simulated ones; after the last event from as long as all of them go on, for what is compared may end
+    sooner."""
+    kinds, best, found = (lay.ensembles.real, lay.ensembles.sim), 0.0, None
+    last = len(lay.ensembles.subtasks) - 1
+    compared = float(np.mean([c.edges[-1] - c.edges[-2] for c in kinds[0]]))
+    longest = min(c.trial.t[-1] - c.edges[-2] for c in kinds[0])
+    since = np.arange(0.0, longest, 1 / lay.rate) if longest > compared + 0.5 / lay.rate else np.zeros(0)
+
+    def beyond(cut: Cut, name: str) -> np.ndarray:
+        return resampled(cut.trial.t, cut.trial.channels[name], cut.edges[-2] + since, lay.rate)
+
+    for k in range(1, last + 1):
+        for c, name in enumerate(lay.ensembles.channels):
+            real, sim = (np.array([windowed(lay, cut, c, k) for cut in kind]) for kind in kinds)
+            if real.shape[1] < 4 * LEAST or real.var(1).mean() < sim.var(1).mean():
+                continue
+            rest = real - sim.mean(0)  # what the simulation has is no ring
+            windows = list(rest if rest.var(1).mean() < real.var(1).mean() else real)
+            if k == last and since.size:
+                windows = [beyond(cut, name) for cut in kinds[0]]
+            swings = from_swing(windows)
+            share = 1 - _screened(swings, lay.rate)[2]
+            strength = share * np.square(_detrended(swings)).sum() / (len(swings) * lay.scale[c] ** 2)
+            if share > RINGS and strength > best:
+                best, found = strength, swings
+    return None if found is None else fit_ring(found, lay.rate)
+
+
+def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
+    """Windows (trials, n) from the largest departure from each one's median on, cut to equal length.
+
+    The largest swing is looked for in the first third.
+    """
+    cut = []
+    for values in windows:
+        early = values[: max(int(values.size * SWING), 1)]
+        cut.append(values[int(np.abs(early - np.median(values)).argmax()) :])
+    n = min(v.size for v in cut)
+    return np.array([v[:n] for v in cut])
+
+
+def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
+    """The ring common to several windows.
+
+    Args:
+        windows: Samples (trials, n), from a swing on.
+        rate: Of the samples [Hz].
+
+    Returns:
+        The ring; None where windows are too short, or the best frequency lies at an end of the range that
+        they resolve, or the best damping is none of a ring.
+    """
+    ends = np.log([_range(windows, rate), (LIGHTEST, HEAVIEST)])
+
+    def refined(windows: np.ndarray, start: np.ndarray) -> np.ndarray:
+        return minimize(
+            lambda u: np.log(_left(windows, rate, *np.exp(u))), start, method="Nelder-Mead",
+            bounds=[*map(tuple, ends)], options={"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},
+        ).x  # fmt: skip
+
+    *start, left = _screened(windows, rate)
+    if left == 1.0:
+        return None
+    best, n = refined(windows, np.log(start)), len(windows)
+    if (np.abs(best[:, None] - ends) < 0.01).any():
+        return None
+    sd, reach = np.full(2, np.nan), np.nan
+    if n > 1:
+        each = np.array([refined(np.delete(windows, i, 0), best) for i in range(n)])
+        sd = np.sqrt((n - 1) / n * ((each - each.mean(0)) ** 2).sum(0))
+        reach = -float(stdtrit(n - 1, 0.05))
+    both_90 = ((float(a), float(b)) for a, b in np.exp(best + np.outer([-reach, reach], sd)).T)
+    return Ring(*map(float, np.exp(best)), *map(float, np.exp(best) * sd), *both_90)
+
+
+def _range(windows: np.ndarray, rate: float) -> tuple[float, float]:
+    """Lowest and highest frequency [Hz] that windows (trials, n) resolve."""
+    return PERIODS * rate / max(windows.shape[1], 1), HIGHEST * rate
+
+
+def _screened(windows: np.ndarray, rate: float) -> tuple[float, float, float]:
+    """Best frequency [Hz] and damping on a grid, and the share of the square about each window's parabola
+    that they leave: 1 where windows are too short."""
+    low, high = _range(windows, rate)
+    if windows.shape[1] < SHORTEST or low >= high:
+        return np.nan, np.nan, 1.0
+    grid = [(f, z) for f in np.geomspace(low, high, FREQUENCIES) for z in DAMPINGS]
+    left, place = min((_left(windows, rate, *g), g) for g in grid)
+    return *place, left
+
+
+def _left(windows: np.ndarray, rate: float, frequency: float, damping: float) -> float:
+    """Share of the square about each window's parabola that a ring leaves, mean over trials."""
+    angle = 2 * np.pi * frequency * np.arange(windows.shape[1]) / rate
+    waves = np.exp(-damping * angle) * np.array([np.sin(angle), np.cos(angle)])
+    basis, rest = np.linalg.qr(_detrended(waves).T)[0], _detrended(windows)
+    size = np.maximum(np.square(rest).sum(1), 1e-300)  # each trial counts alike
+    return max(1 - float((np.square(rest @ basis).sum(1) / size).mean()), 1e-300)
+
+
+def _detrended(windows: np.ndarray) -> np.ndarray:
+    """Windows (trials, n) without the parabola that fits each best."""
+    basis = np.linalg.qr(np.vander(np.linspace(-1, 1, windows.shape[1]), 3))[0]
+    return windows - windows @ basis @ basis.T
