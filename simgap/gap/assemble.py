@@ -404,11 +404,14 @@ def _candidate(
 
 
 def _scattering(s: Scatter, rows: Rows) -> Candidate:
-    """What scatters as a candidate; its variance over that of the noise as it is in these rows."""
+    """What scatters as a candidate; its variance over that of the noise as it is in these rows.
+
+    One whose size is not the same everywhere is an imitation, which nothing speaks for.
+    """
     nothing, count = np.zeros(0), s.variance.size
     variance = s.variance / (1.0 if rows.sd is None else np.square(rows.sd))
     return Candidate(s.effect, (), nothing, nothing, nothing, np.zeros(count), np.zeros((count, 0)), nothing,
-                     nothing, variance, s.known, s.same, frees=s.frees)  # fmt: skip
+                     nothing, variance, s.known if s.same else -np.inf, frees=s.frees)  # fmt: skip
 
 
 # Forces rounded to a step: by how much every residual that they enter is in doubt.
