@@ -248,7 +248,7 @@ def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float
     return 0.5 * float(without - left)
 
 
-SHOWN = 1.0  # chosen: squared residual [noise's] of a measured property's sd, above which it shows at all
+SHOWN = 1.0  # chosen: squared residual [noise's] of a property as wrong as usual, above which it shows at all
 
 
 def rows_of(given: Problem) -> Rows:
@@ -274,7 +274,8 @@ def gap_of(
     usual = given.frame.rig.tolerance == Tolerance()
     scattering, tolerance = [_scattering(s, rows) for s in scatters], tolerated(given)
     # Which properties show is decided here alone: with more noise on the recordings others might.
-    seen = {c.parameters for c in _measured(given, healthy) if np.square(c.jacobian).sum() > SHOWN}
+    measured = _measured(given, healthy)
+    seen = {c.parameters for c in measured if np.square(c.jacobian * c.scale).sum() > SHOWN}
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
         k = problem.num_properties
