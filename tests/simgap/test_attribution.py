@@ -394,6 +394,17 @@ def test_what_changes_sign_between_trials_is_no_cause():
     assert attribute(gap).verdict == "unknown"
 
 
+@pytest.mark.parametrize("apart", [True, False])
+def test_a_measurement_that_trials_contradict_is_named_though_no_trial_is_predicted_better(apart):
+    rows = rows_of(samples=30)
+    column = np.where(rows.channel == 0, 3.0, 0.0)[:, None]  # by one sd of what was measured
+    residual = np.random.default_rng(0).standard_normal(rows.time.size) + 9.0 * column[:, 0]
+    wrong = replace(linear("measured", column, scale=10.0), apart=apart)
+    found = attribute(Gap(rows, residual, column, (wrong, linear("other", column[::-1].copy()))))
+    assert found.how_far is None or not apart
+    assert (found.verdict, found.causes) == (("named", ("measured",)) if apart else ("unknown", ()))
+
+
 def one(name: str, weight: float, known: float = 1.0, causes: tuple[str, ...] | None = None) -> Explanation:
     effects = tuple(sorted(name))
     return Explanation(effects, weight, effects if causes is None else causes, known)
