@@ -113,7 +113,7 @@ def tracked(
             choices = chance.size if loose and weight[t, k].sum() > 0 else 1
             best, chosen_mean, chosen_cov, paid = -np.inf, mean, cov, 0.0
             for r in range(choices):
-                m, p = mean.copy(), cov.copy()
+                m, p = (mean.copy(), cov.copy()) if choices > 1 else (mean, cov)
                 for j in range(joints):
                     if not pinned[t, k, j]:
                         p[j, j] += shares[r] * jump[t, j]

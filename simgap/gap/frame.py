@@ -354,9 +354,9 @@ class Arrays(NamedTuple):
     is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `pushed` (T, N) [m]:
     how far the fingers are seen to go from sample to sample; `kind` (T, N):
     2 * phase, + 1 next to a contact change; `subtask` (T, N);
-    `onehot` (T, N, M): nearest move; `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot;
-    `sample` (T, N, C): noise of one sample of a channel itself; `sensor` (T, N, 3): that of angles, rates and
-    forces as they are in `World`.
+    `onehot` (T, N, M): nearest move; `new` (T, N, 3): first samples with another constant of x, y, offset;
+    `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot; `sample` (T, N, C): noise of one sample of a channel
+    itself; `sensor` (T, N, 3): that of angles, rates and forces as they are in `World`.
     """
 
     there: np.ndarray
@@ -366,6 +366,7 @@ class Arrays(NamedTuple):
     kind: np.ndarray
     subtask: np.ndarray
     onehot: np.ndarray
+    new: np.ndarray
     objects: np.ndarray
     rises: np.ndarray
     phase: np.ndarray
@@ -419,7 +420,8 @@ def build(aligned: AlignedTrials) -> Frame:
     for m, rise in height_equations(task):
         for name, value in rise.items():
             rises[m, task.objects.index(name)] = value
-    onehot = np.eye(moves)[stack["move"].astype(int)]
+    move, place = stack["move"].astype(int), stack["phase"][..., Phase.PLACE].astype(int)
+    grip, part = _others(move), _others(2 * move + place)
     arrays = Arrays(
         stack["there"],
         stack["sd"],
@@ -427,7 +429,8 @@ def build(aligned: AlignedTrials) -> Frame:
         stack["pushed"],
         stack["kind"].astype(int),
         stack["subtask"].astype(int),
-        onehot,
+        np.eye(moves)[move],
+        np.stack([part, grip, grip], -1),
         objects,
         rises,
         stack["phase"],
@@ -446,6 +449,11 @@ def build(aligned: AlignedTrials) -> Frame:
         tuple(np.stack([t.channels[c] for c in FORCE_CHANNELS], 1) for t in trials),
         tuple(group_size(t.rate, MAX_RATE) for t in trials),
     )
+
+
+def _others(number: np.ndarray) -> np.ndarray:
+    """Samples (T, N) with another number than the one before."""
+    return np.diff(number, axis=1, prepend=-1) != 0
 
 
 def _stacked(rows: list[np.ndarray], length: int) -> np.ndarray:

@@ -252,25 +252,19 @@ def in_grip(
     """
     from simgap.recursions import tracked
 
-    place = arrays.phase[..., Phase.PLACE]
-    parts = arrays.onehot[..., None] * np.stack([1 - place, place], -1)[..., None, :]
-    grip, part = _others(arrays.onehot), _others(parts.reshape(*place.shape, -1))
-    slide = SLIDE * world.slip
-    walk = np.square(np.stack([_wider(each) for each in (arrays.pushed, slide, slide)], -1))
-    none = np.zeros((*place.shape, 0))
-    band = world.dead_band or DeadBand(none, none > 0, none, none, none[:, 0])
-    (x, y), apart = swung(world), np.array([-1.0, -1.0, 1.0, 1.0])
-    levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)[..., : band.place.shape[-1]]
+    slide = _wider(SLIDE * world.slip)
+    walk = np.square(np.stack([_wider(arrays.pushed), slide, slide], -1))
+    band, none = world.dead_band, np.zeros((*firm.shape, 0))
+    if band is None:
+        band, levers = DeadBand(none, none > 0, none, none, none[:, 0]), np.zeros((*firm.shape, 4, 0))
+    else:
+        (x, y), apart = swung(world), np.array([-1.0, -1.0, 1.0, 1.0])
+        levers = np.stack([x / 2, y / 2, apart * x * firm[..., None], apart * y], -2)
+        values = values - (levers @ band.place[..., None])[..., 0]
     return tracked(
-        values - (levers @ band.place[..., None])[..., 0], weight, noise, -levers,
-        walk, np.stack([part, grip, grip], -1), ANYWHERE**2, band.pinned, band.place, band.drift, band.wander,
-        band.jump, SHARES, CHANCES,
+        values, weight, noise, -levers, walk, arrays.new, ANYWHERE**2, band.pinned, band.place, band.drift,
+        band.wander, band.jump, SHARES, CHANCES,
     )  # fmt: skip
-
-
-def _others(grips: np.ndarray) -> np.ndarray:
-    """Samples (T, N) of another grip than the one before, of those that each is in (T, N, G)."""
-    return np.pad((grips[:, 1:] * grips[:, :-1]).sum(-1) < 0.5, ((0, 0), (1, 0)), constant_values=True)
 
 
 def _wider(values: np.ndarray) -> np.ndarray:
