@@ -19,9 +19,11 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
   a free swing tells mass from length only because slower motions know the friction. An explanation is ruled
   out where it is less likely than RIVAL of the best, and the odds are worth no more than what a second
   small change of anything gains beyond the best: as much is the model's own error.
-* *Whether*: a change is one that is likelier than nothing by more than the number of candidates, and that
-  predicts motions of NEW that took no part better, by a share that matters; where OLD never made these
-  motions, so that what a model gets wrong in them is not known, from motion to motion, by Student's t.
+* *Whether*: a change is one that is likelier than nothing by more than the number of candidates, and takes a
+  share that matters, of the energy and of what motions of NEW that took no part are missed by. Where OLD
+  never made these motions, what a model gets wrong in them is not known: then this must hold from motion to
+  motion, and delta be that far from nothing, both by Student's t. A second change is sought only where the
+  first fits NEW's logs worse than OLD's motions are predicted.
 * *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
   to motion, and most of that is left.
 
@@ -68,9 +70,7 @@ LADDER = (-1.2, -0.6, -0.25, 0.25, 0.6, 1.2)  # numerics: changes to rank candid
 RUNGS = np.linspace(-2.1, 2.1, 43)  # numerics: from which one is fitted; a free swing has narrow valleys
 TRIED, PAIRED, SECOND = 5, 2, 4  # numerics: changes fitted exactly, of those joined in pairs, and with them
 CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
-MATTERS = (
-    0.1  # chosen: of what is missed of new logs, what a change must take to be more than a day's difference
-)
+MATTERS = 0.1  # chosen: of what is missed of new logs, what a change must take; less a day may make
 DRIFT = 0.1  # prior: of a parameter, or of its usual size: by how much what is fitted differs in NEW
 RIVAL = 0.05  # chosen: of right explanations, those that a wrong one may rule out
 UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called unknown
@@ -90,6 +90,12 @@ class Change:
     energy: float
     left: np.ndarray
     theta: np.ndarray
+
+    @property
+    def by_chance(self) -> float:
+        """How often its surest coordinate is as far from nothing where nothing changed."""
+        each = 2 * student.sf(np.abs(self.x) / np.maximum(self.sd, 1e-12), self.freedom)
+        return min(1.0, self.x.size * float(each.min()))
 
 
 class Comparison:
@@ -193,7 +199,7 @@ class Comparison:
         x = z[p:]
         schur = total[p:, p:] - total[p:, :p] @ np.linalg.solve(total[:p, :p], total[:p, p:])
         occam = float(np.sum(np.log(np.pi * (1 + x**2)))) - 0.5 * k * np.log(2 * np.pi)
-        occam += 0.5 * float(np.linalg.slogdet(schur / self.old.dependence)[1]) if k else 0.0
+        occam += 0.5 * float(np.linalg.slogdet(schur / self.old.dependence + np.eye(k))[1]) if k else 0.0
         energy = self.cost(z, of, mine) / self.old.dependence + occam
         return Change(effects, x, sd, freedom, energy, left, z[:p])
 
@@ -215,10 +221,22 @@ class Comparison:
         """Changes to begin a fit from: of one coordinate many."""
         return [np.zeros(x.size)] if x.size > 1 else [np.array([r]) for r in RUNGS]
 
-    def excess(self, change: Change) -> np.ndarray:
-        """By how much more each motion of NEW is missed (M,) than OLD's, the same one where OLD made all."""
+    @property
+    def missed(self) -> np.ndarray:
+        """How each motion of NEW would be missed (M,) by OLD's others: as OLD's own, if OLD made all, or as
+        its mean."""
+        old = self.old.missed
         mine = np.searchsorted(self.old.units, self.runs.units)
-        return change.left - (self.old.missed[mine] if self.paired else self.old.missed.mean())
+        return old[mine] if self.paired else np.full(mine.size, old.mean())
+
+    def excess(self, change: Change) -> np.ndarray:
+        """By how much more each motion of NEW is missed (M,) than OLD's."""
+        return change.left - self.missed
+
+    def leaves(self, change: Change) -> bool:
+        """Whether NEW's logs are fitted worse than OLD's motions are by fits that did not see them."""
+        count = np.bincount(np.searchsorted(self.runs.units, self.runs.unit))
+        return change.energy > float(count @ self.missed) / self.old.dependence
 
     @property
     def paired(self) -> bool:
@@ -232,9 +250,10 @@ class Comparison:
     def needed(self, change: Change, beyond: Change) -> bool:
         """Whether an explanation is one that a simpler one cannot do without (see above)."""
         shares = 1 - change.left / np.maximum(beyond.left, 1e-12)
-        if self.chance(change, beyond) >= CHANGED or shares.mean() < MATTERS:
+        taken = min(float(shares.mean()), 1 - change.energy / beyond.energy)
+        if self.chance(change, beyond) >= CHANGED or taken < MATTERS:
             return False
-        return self.paired or by_chance(shares) < CHANGED
+        return self.paired or max(by_chance(shares), len(self.candidates) * change.by_chance) < CHANGED
 
     def searched(self) -> list[Change]:
         """Nothing, the most promising single changes, and pairs about the best of them."""
@@ -254,7 +273,7 @@ class Comparison:
             pairs[frozenset((best[0].effects[0], name))] = (best[0], name, scan[name][1])
         for one, two in itertools.combinations(best, 2):
             pairs.setdefault(frozenset((*one.effects, *two.effects)), (one, two.effects[0], two.x))
-        more = self.excess(best[0]).mean() > 0  # else no second change is sought, only what it would do
+        more = self.leaves(best[0])  # else no second change is sought, only what it would do
         both = [
             self.fit(
                 (*one.effects, name),
@@ -509,8 +528,8 @@ def _concluded(
     every = sorted(tried[1:], key=lambda c: c.energy)
     singles, pairs = ([c for c in every if len(c.effects) == n] for n in (1, 2))
     best = next((c for c in singles if found.needed(c, nothing)), nothing)
-    left = best.effects and found.excess(best).mean() > 0  # more than of old logs
-    more = next((c for c in pairs if left and found.needed(c, best)), best)
+    left = pairs if best.effects and found.leaves(best) else ()
+    more = next((c for c in left if found.needed(c, best)), best)
     slack = max((best.energy - c.energy for c in pairs if {*best.effects} < {*c.effects}), default=0.0)
     best, slack = more, max(slack, 0.0) if more is best else 0.0
     least = best.energy + slack

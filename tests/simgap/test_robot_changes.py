@@ -5,13 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 from scipy.stats import ttest_1samp, ttest_ind
 
 from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.changes import Changes, _unlike, added_by_drift, by_chance, changes, jackknife
+from simgap.robots.changes import Changes, Comparison, _unlike, added_by_drift, by_chance, changes, jackknife
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -178,6 +179,20 @@ def test_a_size_takes_in_that_all_else_may_have_drifted():
     whole[p + k :] = np.hstack([new[:p], new[:p, :p] + np.diag(1 / np.maximum(drift, 1e-12))])
     wanted = np.diag(np.linalg.inv(whole))[p : p + k] - np.diag(np.linalg.inv(total))[p:]
     np.testing.assert_allclose(added_by_drift(total, before, drift)[p:], wanted, rtol=1e-6)
+
+
+def test_an_explanations_energy_is_minus_the_log_of_its_evidence():
+    """By quadrature over the change, with nothing fitted along."""
+    every = effects_of(SIMULATOR, logs(0))
+    found = changes(SIMULATOR, logs(0), logs(100, gain=3.5), {"gain": replace(every["gain"], fitted=False)})
+    one = next(c for c in found.tried if c.effects == ("gain",))
+    made = Comparison(found.composed, found.old, [], found.runs.unit)
+    at = made._coordinates(("gain",))
+    x = one.x[0] + np.linspace(-0.1, 0.1, 401)
+    costs = np.array([made.cost(np.array([v]), *at) for v in x]) / found.old.dependence
+    evidence = logsumexp(-costs - np.log(np.pi * (1 + x**2))) + np.log(x[1] - x[0])
+    assert one.energy == pytest.approx(-evidence, abs=0.1)
+    assert found.p_value < 1e-6
 
 
 def test_gains_from_motion_to_motion_are_judged_by_student():
