@@ -20,7 +20,7 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import TAIL
-from hmmseg.robust import robust_sd, weighted_median, white_sd
+from hmmseg.robust import median_of_known, robust_sd, weighted_median, white_sd
 from hmmseg.tables import Brief
 
 RIGID = 4000.0  # chosen: N/m; a rig whose pads are `inf` has no give to take shares of: that of such a pad
@@ -236,8 +236,7 @@ def slopes_within(
         ("rise", "place", signals.y, signals.sd_y / root2, shear_give(signals, rig),
          np.hypot(pads.shear1, pads.shear2) / 2, [held["pickup"], held["place"]]),
     ):  # fmt: skip
-        known = sd[np.isfinite(sd)]
-        noise = float(np.median(known)) if known.size else 0.0
+        noise = median_of_known(sd, 0.0)
         # What readings are rougher than places is noise of the forces: they ring, what they move does not.
         seen = [values[key][group & np.isfinite(values[key])] for group in together]
         rough = [white_sd(one) for one in seen if one.size >= MIN_SAMPLES]

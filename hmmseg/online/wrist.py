@@ -122,8 +122,7 @@ class Wrist:
                 self._gather(newest - BACKLOG / 2)
                 self._rows = [each for each in self._rows if each[0] >= newest - BACKLOG / 2]
             return []
-        window = self._window or 0.0
-        until = newest if final else min(newest - window, self._opening.known)
+        until = newest if final else min(newest - (self._window or 0.0), self._opening.known)
         if not final and until < self._out + BATCH and self._fitted == self._opening.number:
             return []
         self._return()

@@ -254,11 +254,9 @@ def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
 
     Those of contacts that were broken, of so many at once; a contact that is made rings alike.
     """
-    z = [np.zeros(0)]
-    for change in changes:
-        if not change.making and len(change.contacts) == num_contacts:
-            z += [c.pressed[c.place < -SURE * c.sd_place] / c.sd_apart for c in change.contacts]
-    z2 = np.concatenate(z) ** 2
+    broken = (c for c in changes if not c.making and len(c.contacts) == num_contacts)
+    z = [c.pressed[c.place < -SURE * c.sd_place] / c.sd_apart for change in broken for c in change.contacts]
+    z2 = np.concatenate([np.zeros(0), *z]) ** 2
     z2 = z2[np.isfinite(z2)]
     if not z2.size:
         return 1.0

@@ -190,7 +190,12 @@ def log_likelihoods(
     force = features.force - parameters.bias
     free = _log_ungripped(force, scale["force"], span["force"], rung)
     free = free + _broad(features, "vx", "vy") + _broad(features, "y") + _broad(features, "d")
-    held = _log_held(features, parameters, force)
+    # Of the forces that press a block between the fingers, but for the net vertical one.
+    held = log_between((force[:, 0] - force[:, 2]) / 2, 0.0, span["force"], scale["force"])
+    if features.free is not None:
+        held += EDGE * (features.free == 1)
+    net_x, shear = force[:, 0] + force[:, 2], (force[:, 1] - force[:, 3]) / 2
+    held = held + (log_student(net_x, scale["net_x"]) + log_student(shear, scale["shear"]))
     names = dict.fromkeys(str(s.object) for s in subtasks if s.state != FREE)
     grips = {name: held + _log_width(features, parameters, name) for name in names}
     # Contact state, object and resting level [m]: what the emission of a subtask depends on.
@@ -211,16 +216,6 @@ def _broad(f: Features, *names: str) -> np.ndarray:
     """Log density (num_timesteps,) of quantities that may be anything; 0 where missing."""
     parts = [-np.log(f.span[name]) * np.isfinite(getattr(f, name)) for name in names]
     return parts[0] if len(parts) == 1 else parts[0] + parts[1]
-
-
-def _log_held(f: Features, p: Parameters, force: np.ndarray) -> np.ndarray:
-    """Log density of the forces that press a block between the fingers, but for the net vertical one."""
-    grip, net_x = (force[:, 0] - force[:, 2]) / 2, force[:, 0] + force[:, 2]
-    out = log_between(grip, 0.0, f.span["force"], p.scale["force"])
-    if f.free is not None:
-        out += EDGE * (f.free == 1)
-    shear = (force[:, 1] - force[:, 3]) / 2
-    return out + (log_student(net_x, p.scale["net_x"]) + log_student(shear, p.scale["shear"]))
 
 
 def _log_width(f: Features, p: Parameters, name: str) -> np.ndarray:

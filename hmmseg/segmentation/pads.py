@@ -33,7 +33,7 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import SURE, TAIL, decisive
-from hmmseg.robust import NORMAL, robust_sd, weighted_median
+from hmmseg.robust import NORMAL, median_of_known, robust_sd, weighted_median
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
@@ -92,12 +92,10 @@ def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | No
     use = (s.t >= start) & (s.t <= end) & np.isfinite(one + two + s.distance + rate)
     if use.sum() < 6 or not (~alone & use).any():
         return None
-    known = s.sd_x[np.isfinite(s.sd_x)]
-    noise = np.sqrt(2.0) * (float(np.median(known)) if known.size else noise_sd(s.x1))
-    load = np.where(alone, np.nan, one + two)
-    return Squeeze(
-        s.t[use], s.distance[use], rate[use], load[use], noise if noise > 0 else SLOWEST_SD, np.sqrt(2.0) * sd
-    )
+    stated = median_of_known(s.sd_x)
+    noise = np.sqrt(2.0) * (noise_sd(s.x1) if np.isnan(stated) else stated)
+    noise, load = noise if noise > 0 else SLOWEST_SD, np.where(alone, np.nan, one + two)
+    return Squeeze(s.t[use], s.distance[use], rate[use], load[use], noise, np.sqrt(2.0) * sd)
 
 
 @dataclass(frozen=True)
@@ -201,8 +199,7 @@ REACH = 0.4  # numerics: s; free motion before and after a hold that is used: th
 LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be used
 IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
-SLIDING = 0.9  # chosen: quantile of the steepest ratios of forces of all contacts that is friction's
-LOUD = 0.9  # chosen: quantile of what forces show after releases that is how loud they ring
+LARGEST = 0.9  # chosen: quantile of what all contacts show, of friction or of ringing, that is the largest
 
 
 @dataclass(frozen=True)
@@ -313,25 +310,21 @@ def sense(
     `again`: forces have been read again, so that no long delay is left. `paths`: per recording the times
     [s] and subtasks (num_timesteps,) of its alignment.
     """
-    grips: list[Stretch] = []
-    loads: list[Stretch] = []
-    squeezes: list[Squeeze | None] = []
-    ratios: list[float] = []
-    rings: list[tuple[float, float, float]] = []
+    grips, loads, squeezes = list[Stretch](), list[Stretch](), list[Squeeze | None]()
+    ratios, rings = list[float](), list[tuple[float, float, float]]()
     for s, (t, path) in zip(signals, paths, strict=True):
         for step in steps:
             if step.state == ON_GROUND and (path == step.index).sum() > 1:
                 own = np.flatnonzero(path == step.index)
                 start, end = float(t[max(own[0] - 1, 0)]), float(t[min(own[-1] + 1, t.size - 1)])
-                pair = stretches(s, start, end, parameters.weight[str(step.object)], parameters)
-                for out, stretch in zip((grips, loads), pair, strict=True):
-                    if stretch is not None:
-                        out.append(stretch)
+                grip, load = stretches(s, start, end, parameters.weight[str(step.object)], parameters)
+                grips += [] if grip is None else [grip]
+                loads += [] if load is None else [load]
                 ratios += steepest(s, start, end, parameters)
                 rings += ringing(s, start, end, parameters)
                 if not again:
                     squeezes.append(squeeze(s, *_with_free_motion(t, path, steps, step.index), parameters))
-    rung = np.quantile(rings, LOUD, axis=0) if rings else np.zeros(3)
+    rung = np.quantile(rings, LARGEST, axis=0) if rings else np.zeros(3)
     felt = [replace(q, sd_load=float(np.hypot(q.sd_load, rung[2]))) for q in squeezes if q is not None]
     nominal = pads_of(rig)
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
@@ -355,7 +348,7 @@ def sense(
     normal = replace(normal, toe=toe)
     between = BETWEEN * float(np.median([np.median(np.diff(s.t)) for s in signals])) if timing.late else 0.0
     doubt = float(np.sqrt(timing.sd**2 + (LATE_SHARE * timing.delay * timing.late) ** 2 + between**2))
-    friction = float(np.quantile(ratios, SLIDING)) if ratios else np.inf
+    friction = float(np.quantile(ratios, LARGEST)) if ratios else np.inf
     return Sensing(normal, shear, timing.delay, doubt, timing.late, timing.filter, friction)
 
 

@@ -57,10 +57,8 @@ class Contacts:
         if FREE in (before.state, after.state):
             making = before.state == FREE
             fingers = tuple(self._finger(i, stretch, making) for i in (0, 1))
-            if making:
-                return cut(Change(fingers, prior, making, "impact", timing))
-            slips = tuple(self._slip(i, stretch) for i in (0, 1))
-            return cut(Change(fingers, prior, making, "smooth", timing, slips))
+            slips = () if making else tuple(self._slip(i, stretch) for i in (0, 1))
+            return cut(Change(fingers, prior, making, "impact" if making else "smooth", timing, slips))
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
             making = after.state == ON_GROUND
             load = self._load(before, stretch, making)
@@ -180,7 +178,6 @@ def _rates(
 
 
 INTERVAL = (0.05, 0.95)  # physics: a definition: the central 90 %
-NEARBY = 0.15  # chosen: s; a touch known apart from forces this near a boundary is that boundary
 Touches = tuple[tuple[float, float], ...]
 
 
@@ -225,10 +222,10 @@ def boundary_posteriors(
 
 
 def nearest_touch(touches: Touches, found: BoundaryPosterior) -> BoundaryPosterior:
-    """The touch or release that is known apart from forces where there is one nearby, else as it is."""
+    """The touch or release known apart from forces where there is one before a hand drifts, else as it is."""
     middle = found.quantile(0.5)
     for time, sd in sorted(touches, key=lambda touch: abs(touch[0] - middle))[:1]:
-        if abs(time - middle) < max(NEARBY, 3 * sd, 3 * found.sd):
+        if abs(time - middle) < max(DRIFTS, 3 * sd, 3 * found.sd):
             return normal(time, sd)
     return found
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.levels import MOVED, SURE, TAIL, decisive
-from hmmseg.robust import robust_sd
+from hmmseg.robust import bridged, median_of_known, robust_sd
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 
 
@@ -181,11 +181,10 @@ def stretches(
         if use.sum() < 4 or there.sum() < 4:
             out.append(None)
             continue
-        filled = np.interp(s.t, s.t[np.isfinite(load)], load[np.isfinite(load)])
+        filled = bridged(load, s.t)
         before, step = np.r_[filled[0], filled[:-1]], np.diff(s.t, prepend=2 * s.t[0] - s.t[1])
-        known = np.isfinite(stated)
-        sd = float(np.median(stated[known])) if known.any() else noise_sd(value)
-        t = s.t[use]
+        sd, t = median_of_known(stated), s.t[use]
+        sd = noise_sd(value) if np.isnan(sd) else sd
         there &= (s.t >= t[0] - FARTHEST) & (s.t <= t[-1] + FARTHEST)
         out.append(Stretch(t, load[use], before[use], step[use], s.t[there], value[there],
                            max(sd, 1e-9), sure))  # fmt: skip

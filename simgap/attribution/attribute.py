@@ -201,9 +201,10 @@ def attribute(
     p_rest = detected(statistic(f, models, causes)).p_value
     explained = shares(f, model, by_group, rng)
     # Noise that differs from part to part can show a gap somewhere, and none in all squares together.
-    shown = explained.before > explained.floor or verdict.verdict == "none"
+    apart = verdict.verdict == "none" or (causes and all(f.gap.candidates[j].apart for j in causes))
+    shown = explained.before > explained.floor or apart
     remains = explained.remainder if shown else 1.0
-    far = others.how_far(causes) if others is not None and causes else None
+    far = _how_far(f, others, causes)
     chance = acting([Explanation(_names(f, m.effects), float(x)) for m, x in zip(models, w, strict=True)],
                     found.p_value)  # fmt: skip
     somewhere = verdict.verdict != "none" or small is not None
@@ -286,27 +287,35 @@ def _examined(
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
     causes = tuple(j for j in effects if j in scattering or _needed(f, model, j))
+    apart = {j for j in effects if f.gap.candidates[j].apart}
     if others is not None:
-        causes = _predicting(others, causes)
+        causes = _predicting(others, causes, apart)
     shifting = {*causes} - scattering
     left = explained.inside if shifting else 0.0
-    far = others.how_far(causes) if others is not None and causes else None
+    far = _how_far(f, others, causes)
     share = 1 - explained.remainder if far is None else far.fraction
-    if far is None and others is not None and shifting:
+    if far is None and others is not None and shifting - apart:
         share = 0.0  # squares in all are no more than the noise's: there is nothing that could be gone
     sure = known(left, share, detected(statistic(f, models, causes)).p_value) if causes else 0.0
     return _Examined(effects, model, explained, causes, sure)
 
 
-def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
-    """Those causes without which trials that took no part are predicted worse, taken out one by one."""
-    while causes:
-        rest = {j: [i for i in causes if i != j] for j in causes}
-        gains = {j: others.gain(causes, rest[j], rest[j]) for j in causes}
+def _how_far(f: Forms, others: Heldout | None, causes: tuple[int, ...]) -> HowFar | None:
+    """How far causes shrink the gap of trials that took no part, if these can bear on any of them."""
+    apart = all(f.gap.candidates[j].apart for j in causes)
+    return None if others is None or apart else others.how_far(causes)
+
+
+def _predicting(others: Heldout, causes: tuple[int, ...], apart: set[int]) -> tuple[int, ...]:
+    """Those causes without which trials that took no part are predicted worse, taken out one by one, and what
+    is `apart` from all trials."""
+    while judged := {*causes} - apart:
+        rest = {j: [i for i in causes if i != j] for j in judged}
+        gains = {j: others.gain(causes, rest[j], rest[j]) for j in judged}
         least = min(gains, key=lambda j: gains[j])
         if gains[least] > POSITIVE:
             break
-        causes = tuple(j for j in causes if j != least)
+        causes = tuple(rest[least])
     return causes
 
 

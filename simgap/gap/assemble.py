@@ -248,7 +248,7 @@ def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float
     return 0.5 * float(without - left)
 
 
-SHOWN = 1.0  # chosen: squared residual [noise's] of a measured property's sd, above which it shows at all
+SHOWN = 1.0  # chosen: squared residual [noise's] of a property as wrong as usual, above which it shows at all
 
 
 def rows_of(given: Problem) -> Rows:
@@ -274,7 +274,8 @@ def gap_of(
     usual = given.frame.rig.tolerance == Tolerance()
     scattering, tolerance = [_scattering(s, rows) for s in scatters], tolerated(given)
     # Which properties show is decided here alone: with more noise on the recordings others might.
-    seen = {c.parameters for c in _measured(given, healthy) if np.square(c.jacobian).sum() > SHOWN}
+    measured = _measured(given, healthy)
+    seen = {c.parameters for c in measured if np.square(c.jacobian * c.scale).sum() > SHOWN}
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
         k = problem.num_properties
@@ -404,11 +405,14 @@ def _candidate(
 
 
 def _scattering(s: Scatter, rows: Rows) -> Candidate:
-    """What scatters as a candidate; its variance over that of the noise as it is in these rows."""
+    """What scatters as a candidate; its variance over that of the noise as it is in these rows.
+
+    One whose size is not the same everywhere is an imitation, which nothing speaks for.
+    """
     nothing, count = np.zeros(0), s.variance.size
     variance = s.variance / (1.0 if rows.sd is None else np.square(rows.sd))
     return Candidate(s.effect, (), nothing, nothing, nothing, np.zeros(count), np.zeros((count, 0)), nothing,
-                     nothing, variance, s.known, s.same, frees=s.frees)  # fmt: skip
+                     nothing, variance, s.known if s.same else -np.inf, frees=s.frees)  # fmt: skip
 
 
 # Forces rounded to a step: by how much every residual that they enter is in doubt.

@@ -211,10 +211,10 @@ def drawn(
     draws = {}
     for key, p in posterior.parameters.items():
         u = p.mean + p.sd * rng.standard_normal(DRAWS)
-        if key not in of:  # by how much a property that was measured apart is off
+        if key not in of:  # by how much a property was measured too large
             obj, kind = key.rsplit(".", 1)
             one = found.problem.sd[found.problem.frame.task.objects.index(obj), PROPERTIES.index(kind)]
-            return {key: (u * float(one), UNITS[kind])}
+            return {key: (-u * float(one), UNITS[kind])}
         draws[key] = np.asarray(of[key].value(np.clip(u, *of[key].limits)))
     if effect.report is not None:
         return effect.report(draws, found.problem.frame.rig)

@@ -314,7 +314,8 @@ def test_causes_are_those_without_which_other_trials_are_predicted_worse():
     gap = gap_of({0: 4.0, 2: 3.0}, seed=4)
     held = Heldout.of(gap, np.ones(3), range(4))
     assert held is not None
-    assert _predicting(held, (0, 1, 2, 3)) == (0, 2)
+    assert _predicting(held, (0, 1, 2, 3), set()) == (0, 2)
+    assert _predicting(held, (0, 1, 2, 3), {1}) == (0, 1, 2)
     assert held.gain((0, 2), (0,)) > 3 > held.gain((0, 1, 2), (0, 2))
 
 
