@@ -32,7 +32,6 @@ from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.attribution.search import sought, statistic
 from simgap.attribution.verdict import ALARM, entries, log_odds, rows
 from simgap.channels import delayed
-from simgap.effect import Parameter
 from simgap.generic.effects import Scene, Slot, effects, predicted, scene, slots
 from simgap.generic.ring import find_ring
 from simgap.generic.trials import FAST, SLOW, Ensembles, Layout, bin_edges, both, layout, means
@@ -47,8 +46,6 @@ NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
 STEP = 1e-3  # numerics: of a usual size, for derivatives by differences
 STEPS = 20  # numerics: of a fit, at most
 CLOSE = 1e-4  # numerics: relative, of a fit's cost
-AT_END = 0.02  # numerics: share of a range within which a descent that stays inside has run to its end
-NEUTRAL = 1e-9  # numerics: a coordinate that has not moved
 APART = 1e4  # numerics: s; powers have no order in time
 DURATIONS = "duration"
 POWER = ", power"
@@ -263,33 +260,22 @@ def shift_at(given: Scene, mine: Sequence[Slot], u: np.ndarray) -> np.ndarray:
 def fit(
     given: Scene, white: Whitening, real: np.ndarray, sim: np.ndarray, names: Sequence[str]
 ) -> list[Part]:
-    """Effects together fitted to the mean difference of features, channel by channel, from every start.
-
-    What runs to the end of its range is left out: a filter of half a second stands for a course that differs
-    in another way, and is none of this channel's.
-    """
+    """Effects together fitted to the mean difference of features, channel by channel, from every start."""
     out, difference = [], real.mean(0) - sim.mean(0)
     for channel in given.layout.every:
         index = given.layout.of_channel(channel)
         root = white.root[np.ix_(index, index)] * np.sqrt(len(real))
-        mine, inside = [s for name in names for s in slots(given, name, channel)], [False]
-        while mine and not all(inside):
-            u, slopes = _fitted(given, root, difference[index], mine)
-            inside = [not _ended(s.parameter, v) for s, v in zip(mine, u, strict=True)]
-            if not all(inside):
-                mine = [s for s, kept in zip(mine, inside, strict=True) if kept]
+        mine = [s for name in names for s in slots(given, name, channel)]
+        if not mine:
+            continue
+        u, slopes = _fitted(given, root, difference[index], mine)
         every = list(range(len(mine)))
         # Durations are judged one by one.
-        for part in ([every] if channel >= 0 else [[k] for k in every]) if mine else ():
+        for part in [every] if channel >= 0 else [[k] for k in every]:
             own, whole = tuple(mine[k] for k in part), np.zeros((difference.size, 1 + len(part)))
             whole[index, 0], whole[index, 1:] = shift_at(given, own, u[part]), slopes[:, part]
             out.append(Part(own, u[part], whole[:, 0], whole[:, 1:]))
     return out
-
-
-def _ended(p: Parameter, value: float) -> bool:
-    end = p.limits[int(value > 0)]
-    return bool(abs(value) > NEUTRAL and abs(value - end) < AT_END * abs(end))
 
 
 def _fitted(
