@@ -151,14 +151,12 @@ def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> 
     `found`: means by (object, property) [N, m].
     """
     for obj in task.objects:
-        weight, width = found.get((obj, "weight")), found.get((obj, "width"))
-        if weight is None or width is None or width <= 0:
-            continue
+        weight, width = (found.get((obj, prop), 0.0) for prop in ("weight", "width"))
         height = found.get((obj, "height"), width)
         area = width * (height if height > 0 else width)
-        depth = weight / (rig.gravity * STEEL * area)
-        if depth < DEEPEST * width:
+        if width <= 0 or weight < DEEPEST * width * rig.gravity * STEEL * area or weight == 0:
             continue
+        depth = weight / (rig.gravity * STEEL * area)
         density = weight / (rig.gravity * area**1.5)
         unit = min(("mN", "gf"), key=lambda name: abs(np.log(density * UNITS[name][1] / LIGHT)))
         names = rig.gripper.wrench[:3] if rig.gripper is not None else FORCE_CHANNELS
@@ -174,12 +172,9 @@ def unrepeated(design: Design) -> list[str]:
     """Where no grip repeats another, the prior alone says how far off the contact equations may be."""
     seen = np.bincount(design.channel, minlength=len(CHANNELS)) > 0
     alone = [name for name, n, s in zip(CHANNELS, design.repeats(), seen, strict=True) if s and n == 0]
-    if not alone:
-        return []
-    return [
-        f"no grip repeats another, so how far the model itself may be off in {', '.join(alone)} is taken "
-        "from its prior; a second trial would show it"
-    ]
+    text = (f"no grip repeats another, so how far the model itself may be off in {', '.join(alone)} is taken "
+            "from its prior; a second trial would show it")  # fmt: skip
+    return [text] * bool(alone)
 
 
 def unchecked(design: Design, rig: Rig) -> list[str]:

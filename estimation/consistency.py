@@ -31,7 +31,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -158,8 +158,7 @@ def _carried(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterato
     of, sums, apart, factors, weights, noises = [], [], [], [], [], []
     for a, move, weight in _carries(weighed, "force", "fy1", "fy2"):
         s, inside = a.signals, weight > 0
-        factor = gravity_factor(s, rig)
-        free = a.weights.free > 0
+        factor, free = gravity_factor(s, rig), a.weights.free > 0
         if free.sum() < MIN_FREE:
             continue
         noises.append([np.nanmean(np.diff(np.where(free, f, np.nan), 2) ** 2) / 6 for f in (s.fy1, s.fy2)])
@@ -264,16 +263,16 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
         grips = list(_grips(a, aligned, one.present))
         for grip in grips:
             start, end = spans[grip.subtask]
+            of_it = [g.subtask for g in grips if g.object == grip.object]
             if grip.key == "pickup":  # it has stood there since it was put down, or from the beginning
-                before = [g.subtask for g in grips if g.object == grip.object and g.subtask < grip.subtask]
+                before = [k for k in of_it if k < grip.subtask]
                 since, until = spans[max(before)][1] if before else s.t[0], start
-                under = support[grip.object]
             else:
-                after = [g.subtask for g in grips if g.object == grip.object and g.subtask > grip.subtask]
+                after = [k for k in of_it if k > grip.subtask]
                 since, until = end, spans[min(after)][0] if after else s.t[-1] + 1
-                under = support[grip.object] = task.performed[grip.move].to
+                support[grip.object] = task.performed[grip.move].to
             at = (s.t > since + APART) & (s.t < until - APART)
-            floor = -np.inf if under == GROUND else grip.y - MOVED
+            floor = -np.inf if support[grip.object] == GROUND else grip.y - MOVED
             for x, y in ((s.x1, s.y1), (s.x2, s.y2)):
                 within = at & (y < grip.y) & (y > floor)
                 depth = np.minimum(x - grip.x1, grip.x2 - x)[within]
@@ -351,7 +350,7 @@ class ForceScale:
         """Draws (walkers, steps, Q), those of `weights` [N] with g drawn from its posterior."""
         out, size = chain.copy(), chain.shape[:2]
         misread = rng.uniform(size=size) < self.probability
-        out[..., weights] *= np.exp(-misread * rng.choice(GRID, size, p=self.density))[..., None]
+        out[..., weights] *= np.exp(-(misread * rng.choice(GRID, size, p=self.density)))[..., None]
         return out
 
     def remark(self) -> str:
@@ -431,18 +430,13 @@ def _noise_excess(weighed: Sequence[WeighedTrial], rig: Rig) -> tuple[float, flo
     out = []
     for axis in "xy":
         bends, followed = [], []
-        for a in weighed:
-            free = a.weights.free > 0
-            for finger in (1, 2):
-                force = getattr(a.signals, f"f{axis}{finger}")
-                bend = np.diff(np.where(free, force, np.nan), 2)
-                bends.append(bend[np.isfinite(bend)] / a.signals.sd_force)
-                both = bend[1:] * bend[:-1]
-                followed.append(both[np.isfinite(both)] / a.signals.sd_force**2)
-        every, neighbours = np.concatenate(bends), np.concatenate(followed)
-        if neighbours.size < MIN_FREE or not every.any():
-            return None
-        if float(neighbours.mean() / np.mean(every**2)) > WHITE:
+        for a, finger in product(weighed, (1, 2)):
+            force = np.where(a.weights.free > 0, getattr(a.signals, f"f{axis}{finger}"), np.nan)
+            bend = np.diff(force, 2) / a.signals.sd_force
+            bends.append(bend)
+            followed.append(bend[1:] * bend[:-1])
+        every, neighbours = (v[np.isfinite(v)] for v in map(np.concatenate, (bends, followed)))
+        if neighbours.size < MIN_FREE or not every.any() or neighbours.mean() / np.mean(every**2) > WHITE:
             return None
         shown = robust_sd(every) / np.sqrt(6)
         if shown == 0:  # coarser than its noise

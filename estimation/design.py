@@ -128,7 +128,7 @@ def determined(
 ) -> tuple[Unknown, ...]:
     """What the moves recorded in `there` (num_moves, 3) determine, objects in the task's order."""
     weighed, spanned = (set(np.array(objects)[there[:, c]]) for c in (FORCE, DISTANCE))
-    heights = simplest_combinations([rises[m] for m in np.flatnonzero(there[:, RISE])], task.objects)
+    heights = simplest_combinations([rises[int(m)] for m in np.flatnonzero(there[:, RISE])], task.objects)
     out = []
     for name in task.objects:
         shown = {"weight": name in weighed, "width": name in spanned, "height": {name: 1} in heights}

@@ -204,11 +204,11 @@ def identify_aligned(
         if sampled.converged:
             centres = {u.name: float(sampled.flat[:, i].mean()) for i, u in enumerate(design.unknowns)
                        if u.single and i not in sampled.impossible}  # fmt: skip
-        sampled = replace(sampled, chain=sampled.chain[..., kept])
-        if scale is not None:
-            heavy = [i for i, u in enumerate(unknowns) if u.prop == "weight"]
-            sampled = replace(sampled, chain=scale.corrected(sampled.chain, heavy, rng))
-            warnings += [scale.remark()] * bool(heavy)
+        chain, heavy = sampled.chain[..., kept], [i for i, u in enumerate(unknowns) if u.prop == "weight"]
+        if scale is not None and heavy:
+            chain = scale.corrected(chain, heavy, rng)
+            warnings.append(scale.remark())
+        sampled = replace(sampled, chain=chain)
     draws = np.zeros((0, 0)) if sampled is None or not kept else sampled.flat
     num = sum(u.single for u in unknowns)  # singles come first
     warnings += [
@@ -238,12 +238,10 @@ def identify_aligned(
 def impossible(design: Design, sampled: Draws) -> dict[str, str]:
     """Why properties that could be worked out are none: by `object.property`, those that no block has."""
     out = {}
-    for i in sampled.impossible:
-        size = float(sampled.flat[:, i].mean())
-        name = ".".join(design.unknowns[i].name)
-        unit = UNITS[design.unknowns[i].prop]
-        text = f"{name} comes out at {size:.3g} {unit}, as no block has it: positions or rig.toml are off"
-        out |= dict.fromkeys(design.unknowns[i].properties, text)
+    for i, u in ((i, design.unknowns[i]) for i in sampled.impossible):
+        size = f"{float(sampled.flat[:, i].mean()):.3g} {UNITS[u.prop]}"
+        text = f"{'.'.join(u.name)} comes out at {size}, as no block has it: positions or rig.toml are off"
+        out |= dict.fromkeys(u.properties, text)
     return out
 
 

@@ -122,7 +122,8 @@ def _between(
 ) -> tuple[np.ndarray, float]:
     """What to weigh samples by (num_timesteps,) for a slope amid those that noise allows, and its doubt.
 
-    Forces that ring make the slope over their give flat, places that are off make it steep (`amid`).
+    Forces that ring make the slope over their give flat, places that are off make it steep
+    (`hmmseg.errors_in_variables`).
     """
     count = float(trust.sum()) * max(1 - fitted / max(np.count_nonzero(trust), 1), 0.0)
     both = float(trust @ (give * place))

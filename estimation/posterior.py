@@ -11,11 +11,9 @@ model error that all grips have alike,
 
 (What all grips have alike no repeat can show. It is at least what the prior says and at least as
 large as what differs between them. A slope shows the same shares as its grip's mean, but a grip that
-does not follow its equation is no reliable witness of it.) The density of the scales is in
-`estimation.density`. Unknowns have a flat prior in here; their own is put in when they are drawn
-(`estimation.sampler`).
-
-The density of the scales, written once for NumPy, which samples it, and JAX, which seeks its mode.
+does not follow its equation is no reliable witness of it.) Unknowns have a flat prior in here; their own is
+put in when they are drawn (`estimation.sampler`). The density of the scales is written once for NumPy, which
+samples it, and JAX, which seeks its mode.
 
 An unknown belongs to one channel and is eliminated there. What remains of a channel is a small quadratic
 form in the shares e, f of all channels and the hand's deviations z, which depends on r_c = (k_c / s_c)^2
@@ -184,7 +182,7 @@ class Posterior:
         return self.least_variance + np.concatenate([own, own], axis=-1)
 
     def log_prob(self, theta: np.ndarray) -> np.ndarray:
-        """Log posterior density (W,) of scales (W, 6), all else integrated out (`density.log_density`)."""
+        """Log posterior density (W,) of scales (W, 6), all else integrated out."""
         parts = [log_density(theta[k : k + BATCH], self.tables) for k in range(0, len(theta), BATCH)]
         return np.concatenate(parts)
 
@@ -269,29 +267,19 @@ def _tabulate(post: Posterior) -> Tables:
         count[c] = len(rows) - which.size
         place = np.array([0, 1 + c, 1 + NUM_CHANNELS + c, *range(1 + NUM_SHARES, size)])
         every = np.concatenate([rows, residual[:, None], shared[:, num:], shared[:, :num]], axis=1)
-        left, log_det[c] = _eliminated(post, c, every, which.size, grid)
+        # At s = 1, with k^2 in units of its prior median's square on the grid, unknowns are eliminated.
+        mine, num_q, width = post.rows.channel == c, which.size, every.shape[1]
+        unit2 = (priors.SCATTER_MEDIAN[c] * post.rows.unit[mine]) ** 2
+        variance = post.rows.variance[mine] + grid[:, None] * unit2  # G, n
+        outer = (every[:, :, None] * every[:, None, :]).reshape(len(every), -1)
+        normal = (1 / variance @ outer).reshape(len(grid), width, width)
+        chol = np.linalg.cholesky(normal[:, :num_q, :num_q])
+        cross = np.linalg.solve(chol, normal[:, :num_q, num_q:])
+        halved = np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
+        log_det[c] = np.log(variance).sum(axis=1) + 2 * halved
+        left = normal[:, num_q:, num_q:] - np.swapaxes(cross, 1, 2) @ cross
         forms[c][:, place[:, None], place] = left
     return Tables(forms, log_det, count, hand, post.least_variance, post.scale_sd)
-
-
-def _eliminated(
-    post: Posterior, c: int, every: np.ndarray, num_q: int, grid: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of one channel's rows (n, M) the quadratic forms (G, M - Q, M - Q) left, log determinants (G,).
-
-    The first Q columns, those of unknowns, are eliminated; s = 1, and k^2 in units of its prior median's
-    square is the grid (G,).
-    """
-    mine = post.rows.channel == c
-    unit2 = (priors.SCATTER_MEDIAN[c] * post.rows.unit[mine]) ** 2
-    variance = post.rows.variance[mine] + grid[:, None] * unit2  # G, n
-    outer = (every[:, :, None] * every[:, None, :]).reshape(len(every), -1)
-    normal = (1 / variance @ outer).reshape(len(grid), every.shape[1], every.shape[1])
-    chol = np.linalg.cholesky(normal[:, :num_q, :num_q])
-    cross = np.linalg.solve(chol, normal[:, :num_q, num_q:])
-    left = normal[:, num_q:, num_q:] - np.swapaxes(cross, 1, 2) @ cross
-    halved = np.log(np.diagonal(chol, axis1=1, axis2=2)).sum(axis=1)
-    return left, np.log(variance).sum(axis=1) + 2 * halved
 
 
 TOLERANCE, MAX_STEPS = 1e-6, 256  # numerics: relative and absolute, of scales and density

@@ -5,9 +5,7 @@ task. Most proposals are independent draws (`Proposal`), the rest differential e
 which frees walkers that it would hold in a tail. benchmarks/moves.py of commit f82105c compares them with
 emcee's stretch move.
 
-Draws where it is open whether the rig's pads are as it says: from both possibilities, by their odds.
-
-Slopes within a grip may contradict `[fingertip]` without proving it wrong (`compliance.misstated`). One
+Slopes within a grip may contradict `[fingertip]` without proving it wrong (`estimation.pads.misstated`). One
 design then believes the rig, another doubts it by as much as the slopes say; widths are drawn from the
 latter with the probability that the pads' give along the grip is wrong, heights with that of their shear.
 """

@@ -20,8 +20,8 @@ from typing import Any
 
 from hmmseg.errors import InputError
 from hmmseg.io.formats import KINDS, kind_of
-from hmmseg.io.rig import read_rig
-from hmmseg.io.task import read_task
+from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.task import BlockTask, read_task
 from hmmseg.segmentation.spans import Segmentation
 
 LOCAL = "local"
@@ -57,7 +57,11 @@ def recordings_in(paths: Sequence[Path]) -> list[Path]:
     return out
 
 
-_LAB = functools.cache(lambda task, rig: (read_task(task), read_rig(rig)))
+@functools.cache
+def _lab(task: Path, rig: Path) -> tuple[BlockTask, Rig]:
+    description = read_task(task)
+    assert isinstance(description, BlockTask)
+    return description, read_rig(rig)
 
 
 def segment_one(path: Path, task: Path, rig: Path) -> Segmented:
@@ -65,7 +69,7 @@ def segment_one(path: Path, task: Path, rig: Path) -> Segmented:
     from hmmseg.hand.read import read_trial
     from hmmseg.segmentation.align import segment
 
-    description, hand = _LAB(task, rig)
+    description, hand = _lab(task, rig)
     trial = read_trial(path, hand)
     segmentation = replace(segment([trial], description, hand)[0], recorded=None)
     return Segmented(segmentation, tuple(trial.warnings), tuple(trial.notes))

@@ -56,7 +56,7 @@ def tables(document: dict[str, Any]) -> list[Table]:
         shown, known = shown_as(p["unit"]), ("undetermined", "")
         nominal = "" if "nominal" not in p else f"{shown[0] * p['nominal']:.4g} {shown[1]}"
         if p["mean"] is not None:
-            known = estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown)
+            known = estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown=shown)
         rows.append((p["name"], nominal, *known))
     heads = ("parameter", "the model has", "calibrated", "90 % interval")
     after = document["heldout"]["after"]

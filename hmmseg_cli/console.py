@@ -18,7 +18,7 @@ import sys
 import tempfile
 import tomllib
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +40,10 @@ class Grouped(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Options in groups, as their declarations name them."""
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for option in self.get_params(ctx):
-            shown = option.get_help_record(ctx)
-            if shown is not None:
-                kind = "Arguments" if option.param_type_name == "argument" else "Options"
-                groups.setdefault(getattr(option, "rich_help_panel", None) or kind, []).append(shown)
-        _write_groups(formatter, groups)
+        kinds = {"argument": "Arguments", "option": "Options"}
+        rows = ((getattr(p, "rich_help_panel", None) or kinds[p.param_type_name], p.get_help_record(ctx))
+                for p in self.get_params(ctx))  # fmt: skip
+        _write_groups(formatter, rows)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Examples, as they are typed."""
@@ -60,18 +57,19 @@ class Hmmseg(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Commands in groups, as `main` names them."""
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for name in self.list_commands(ctx):
-            command: Any = self.get_command(ctx, name)
-            row = (name, command.get_short_help_str(formatter.width))
-            groups.setdefault(command.rich_help_panel or "Commands", []).append(row)
-        _write_groups(formatter, groups)
+        commands: list[Any] = [self.get_command(ctx, name) for name in self.list_commands(ctx)]
+        rows = ((c.rich_help_panel, (c.name, c.get_short_help_str(formatter.width))) for c in commands)
+        _write_groups(formatter, rows)
 
 
-def _write_groups(formatter: Any, groups: dict[str, list[tuple[str, str]]]) -> None:
-    for title, rows in groups.items():
+def _write_groups(formatter: Any, rows: Iterable[tuple[str, tuple[str, str] | None]]) -> None:
+    groups: dict[str, list[tuple[str, str]]] = {}
+    for title, row in rows:
+        if row is not None:  # a hidden option has none
+            groups.setdefault(title, []).append(row)
+    for title, own in groups.items():
         with formatter.section(title):
-            formatter.write_dl(rows)
+            formatter.write_dl(own)
 
 
 class Output:

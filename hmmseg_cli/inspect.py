@@ -71,7 +71,7 @@ def extended(rig_file: Path, found: Sequence[Inspection]) -> str:
 
 def _show(out: Output, found: Inspection) -> None:
     head = f"{found.file}: {found.samples} samples"
-    if found.rate is not None:
+    if found.rate is not None and found.start is not None and found.end is not None:
         head += f" at {found.rate:.4g} Hz, {found.end - found.start:.4g} s"
     if found.parts:
         head += f"; the first of {len(found.parts)} recordings ({found.parts[0]} ... {found.parts[-1]})"

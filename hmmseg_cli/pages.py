@@ -124,8 +124,8 @@ def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]
             text = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
         if entry is not None and entry.get("mean") is not None:
             text = estimate(entry["mean"], entry["sd"], shown)
-            inner = interval(*entry["interval_68"], shown, sds=2.0)
-            outer = interval(*entry["interval_95"], shown, sds=3.9)
+            inner = interval(*entry["interval_68"], shown=shown, sds=2.0)
+            outer = interval(*entry["interval_95"], shown=shown, sds=3.9)
             if value is not None:
                 compared = body.get("actual", {}).get(obj, {}).get(prop, {})
                 deviation = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"

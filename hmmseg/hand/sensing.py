@@ -144,8 +144,11 @@ class Fault:
 def sensed(trial: Trial, rig: Rig) -> Trial:
     """The trial without readings that are none, its faults named in `faults` and `warnings`."""
     channels = {name: values.copy() for name, values in trial.channels.items()}
-    found = [*_missing(trial), *_clock(trial.t)]
-    kinds = _kinds(trial, rig)
+    found, kinds, steps = _missing(trial), _kinds(trial, rig), np.diff(trial.t)
+    wide = np.flatnonzero(steps > max(PAUSE, USUAL * float(np.quantile(steps, 0.95))))
+    usual = f"rows are {float(np.median(steps)):.2g} s apart: rows are missing, or the clock was set"
+    found += [Fault("t", f"jumps by {steps[i]:.3g} s at {trial.t[i]:.2f} s, where {usual}")
+              for i in wide[:LISTED]]  # fmt: skip
     for names, _ in kinds:
         for name in names:
             found += _far_off(name, trial.t, channels[name])
@@ -313,18 +316,17 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
     if len(stepping) != 1:
         return []
     name, (there, steps) = next(iter(stepping.items()))
-    at, offset = np.flatnonzero(steps), np.concatenate([[0.0], np.cumsum(steps)])
+    at, offset = np.flatnonzero(steps), np.r_[0.0, np.cumsum(steps)]
     if at.size > STEPS:
         return []
     away = np.abs(offset) > np.abs(steps[at]).min() / 2
     problem = f"jumps by {steps[at[0]]:.3g} at {t[there[at[0] + 1]]:.2f} s, as its velocity does not"
     if away[-1]:  # it never comes back: either side may be the right one
-        channels[name][:] = np.nan
-        spans = ((float(t[0]), float(t[-1])),)
-        return [Fault(name, f"{problem}: which side is right nothing tells, so it is left out", spans)]
-    inside = there[away]
-    channels[name][inside[0] : inside[-1] + 1] = np.nan
-    return [Fault(name, f"{problem}, and is left out", ((float(t[inside[0]]), float(t[inside[-1]])),))]
+        first, last, why = 0, t.size - 1, ": which side is right nothing tells, so it is left out"
+    else:
+        first, last, why = there[away][0], there[away][-1], ", and is left out"
+    channels[name][first : last + 1] = np.nan
+    return [Fault(name, problem + why, ((float(t[first]), float(t[last])),))]
 
 
 def _missing(trial: Trial) -> list[Fault]:
@@ -349,14 +351,3 @@ def _missing(trial: Trial) -> list[Fault]:
         rows = "every row" if whole == 0 else f"all but {whole:.0%} of the rows"
         return [Fault(rows, "without some reading")]
     return out
-
-
-def _clock(t: np.ndarray) -> list[Fault]:
-    """Jumps of the clock, or stretches without rows."""
-    steps = np.diff(t)
-    wide = np.flatnonzero(steps > max(PAUSE, USUAL * float(np.quantile(steps, 0.95))))
-    usual = float(np.median(steps))
-    return [
-        Fault("t", f"jumps by {steps[i]:.3g} s at {t[i]:.2f} s, where rows are {usual:.2g} s apart: rows are "
-              "missing, or the clock was set") for i in wide[:LISTED]
-    ]  # fmt: skip

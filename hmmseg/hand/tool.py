@@ -70,20 +70,13 @@ def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose
         where = f"{trial.file}: [gripper] closing"
         problem = f"the pads close along {gripper.closing}, which is mostly up and down"
         raise InputError(where, problem, "the axis along which they close, and a quaternion x, y, z, w")
-    window = _window(t, position) if window is None else window
+    if window is None:  # as wide as leaves little noise in the acceleration
+        # Of a parabola through n samples the second derivative's variance is 720 s^2 / (n^5 dt^4).
+        period, sd = float(np.median(np.diff(t))), max(white_sd(c) for c in position.T)
+        needed = (720 * sd**2 / period**4 / QUIET**2) ** 0.2 * period
+        window = float(np.clip(needed, WINDOW, WIDEST))
     velocity, acceleration = (smooth(t, position, deriv, window) for deriv in (1, 2))
     return Pose(t, position, velocity, acceleration, turned, up, across / np.linalg.norm(across), window)
-
-
-def _window(t: np.ndarray, position: np.ndarray) -> float:
-    """Smoothing window [s] that leaves little noise in the acceleration.
-
-    Of a parabola through n samples, the second derivative's variance is 720 s^2 / (n^5 dt^4) for large n.
-    """
-    period = float(np.median(np.diff(t)))
-    sd = max(white_sd(c) for c in position.T)
-    needed = (720 * sd**2 / period**4 / QUIET**2) ** 0.2 * period
-    return float(np.clip(needed, WINDOW, WIDEST))
 
 
 def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
@@ -131,11 +124,20 @@ def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WI
     period = float(even[1] - even[0])
     length = max(LEAST, round(window / period) // 2 * 2 + 1)
     length = min(length, (len(t) - 1) // 2 * 2 + 1)
-    from scipy.signal import savgol_filter  # slow to import
-
-    gridded = np.stack([np.interp(even, t, column) for column in flat.T])
-    found = savgol_filter(gridded, length, 2, deriv, period)
-    return np.stack([np.interp(t, even, column) for column in found], axis=1).reshape(values.shape)
+    # As scipy.signal.savgol_filter, whose import takes half a second: the first and the last half of `length`
+    # are on the first and the last parabola.
+    half = length // 2
+    steps = np.vander(np.arange(-half, half + 1), 3, increasing=True)
+    fit = np.linalg.pinv(steps)
+    slopes = [steps, np.pad(steps[:, :2], ((0, 0), (1, 0))) * (0, 1, 2), np.eye(3)[[2] * length] * 2][deriv]
+    out = []
+    for column in flat.T:
+        x = np.interp(even, t, column)
+        middle = np.convolve(x, (slopes[half] @ fit)[::-1], mode="valid")
+        first, last = (slopes @ (fit @ end) for end in (x[:length], x[-length:]))
+        found = np.concatenate([first[:half], middle, last[half + 1 :]]) / period**deriv
+        out.append(np.interp(t, even, found))
+    return np.stack(out, axis=1).reshape(values.shape)
 
 
 ROUNDS = 20  # numerics: of an iteration that settles sooner

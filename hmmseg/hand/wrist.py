@@ -3,10 +3,8 @@
 The wrist feels the sum of what both fingers do; each finger's channels hold half of it. What
 they press against each other with does not reach the wrist. Where no grip force is recorded, the
 pads' own spring gives it: their squeeze is the opening at which they touched less the one they are
-held at (`hmmseg.hand.opening`). That says when something is held, and where the touch lies within what
+held at. That says when something is held, and where the touch lies within what
 the slowing of the closing leaves open, but is no measured force: friction is not bounded by it.
-
-What a gripper holds between its closings, and how its load tells a mapping that cannot be.
 
 A hand that is raised with what it holds bears it. Where no hold lifts anything, the columns are read the
 other ways that a rig may have it, and the way in which the hand lifts something every time is what to write.
@@ -251,10 +249,9 @@ def counts_closing(trial: Trial, rig: Rig) -> InputError:
     gripper = rig.wrist
     most = float(sum(bridged(trial.channels[name], trial.t).max() for name in gripper.opening))
     name = gripper.opening[0]
-    fields = changed(name, rig, sign=-1, offset=round(most, 4))
-    finding = Finding(name, "", fields)
+    remedy = Finding(name, "", changed(name, rig, sign=-1, offset=round(most, 4))).remedy
     problem = "is widest while the hand carries something: it counts how far the gripper has closed"
-    return InputError(f"{trial.file}: column {name}", problem, finding.remedy)
+    return InputError(f"{trial.file}: column {name}", problem, remedy)
 
 
 def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
@@ -548,10 +545,14 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     touches = tuple(touch for each in grips for touch in _touches(t, opening, each))
     surely = np.ones(t.size)
     for each in grips:
-        last = min(each.stop, t.size) - 1
-        surely[(t > t[each.start] - SURELY) & (t < t[last] + SURELY)] = 0.0
-    wrong = _inertia(t, pose, tool, rig.wrist.turns, rig.gravity)
-    timing = _timing(t, pose, np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)), fy, tool.noise)
+        surely[(t > t[each.start] - SURELY) & (t < t[min(each.stop, t.size) - 1] + SURELY)] = 0.0
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
+    wrong, step = _inertia(t, pose, tool, rig.wrist.turns, rig.gravity), float(np.median(np.diff(t)))
+    # A load that changes by so much per second is off by that much of its time.
+    pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(fy), t)), _around(t, pose))
+    late = np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)) / np.maximum(pace, tool.noise / step)
+    timing = np.minimum(late, pose.window / 2)
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
                    free=surely, notes=(*_notes(trial, rig, tool), *strays),
                    hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip
@@ -575,17 +576,6 @@ def _inertia(t: np.ndarray, pose: Pose, tool: Tool, turns: bool, gravity: float)
     if not turns:
         wrong[:, 0] = np.hypot(wrong[:, 0], tool.mass * gravity * TILT)
     return wrong
-
-
-def _timing(t: np.ndarray, pose: Pose, wrong: np.ndarray, load: np.ndarray, noise: float) -> np.ndarray:
-    """How uncertain a load [N] that is `wrong` [N] makes the moment of its change (num_timesteps,) [s].
-
-    A load that changes by so much per second is off by that much of its time.
-    """
-    from scipy.ndimage import maximum_filter1d  # slow to import
-
-    pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(load), t)), _around(t, pose))
-    return np.minimum(wrong / np.maximum(pace, noise / float(np.median(np.diff(t)))), pose.window / 2)
 
 
 def _around(t: np.ndarray, pose: Pose) -> int:

@@ -67,8 +67,10 @@ class Chain:
         self.bands: tuple[Any, ...] = bands
         for d, band in enumerate(bands):
             self._check(d, band)
-        self.log_initial = self._end("log_initial", log_initial, 0)
-        self.log_final = self._end("log_final", log_final, -1)
+        first, last = np.full((2, self.num_states), -np.inf)
+        first[0] = last[-1] = 0.0
+        self.log_initial = end_weights("log_initial", log_initial, first)
+        self.log_final = end_weights("log_final", log_final, last)
 
     def tree_flatten(self) -> tuple[tuple, None]:
         """The weights, for JAX."""
@@ -103,17 +105,6 @@ class Chain:
             raise ValueError(f"{name}: shape {band.shape}, expected {expected}")
         _refuse_bad(name, band)
 
-    def _end(self, name: str, end: ArrayLike | None, index: int) -> Any:
-        if end is None:
-            out = np.full(self.num_states, -np.inf)
-            out[index] = 0.0
-            return out
-        out = _weights(end)
-        if out.shape != (self.num_states,):
-            raise ValueError(f"{name}: shape {out.shape}, expected {(self.num_states,)}")
-        _refuse_bad(name, out)
-        return out
-
     def band(self, d: int, num_samples: int) -> np.ndarray:
         """Weights (num_samples - 1, num_states - d) of going from k to k + d."""
         return np.broadcast_to(self.bands[d], (num_samples - 1, max(self.num_states - d, 0)))
@@ -132,6 +123,15 @@ class Chain:
             padded = xp.concatenate([xp.full((len(band), d), -np.inf, band.dtype), band], axis=1)
             whole.append(xp.broadcast_to(padded, (rows, self.num_states)))
         return xp.stack(whole, axis=1)
+
+
+def end_weights(name: str, given: ArrayLike | None, otherwise: np.ndarray) -> Any:
+    """Log weights of the first or last state, `otherwise` where none are given; ValueError for bad ones."""
+    out = otherwise if given is None else _weights(given)
+    if out.shape != otherwise.shape:
+        raise ValueError(f"{name}: shape {out.shape}, expected {otherwise.shape}")
+    _refuse_bad(name, out)
+    return out
 
 
 def _weights(given: ArrayLike) -> Any:

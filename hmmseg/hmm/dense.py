@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +48,7 @@ def log_evidence(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transit
     weights, blocks, transition = _start(log_likelihoods, log_initial, log_transition)
     with jax.enable_x64(True):
         for x, n in blocks:
-            weights = np.asarray(_sum(weights, x, transition, n))
+            weights = np.asarray(_pass(weights, x, transition, n, best=False)[0])
     return float(np.logaddexp.reduce(weights))
 
 
@@ -57,7 +58,7 @@ def viterbi(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transition: 
     taken = []
     with jax.enable_x64(True):
         for x, n in blocks:
-            weights, sources = jax.tree.map(np.asarray, _best(weights, x, transition, n))
+            weights, sources = jax.tree.map(np.asarray, _pass(weights, x, transition, n, best=True))
             taken.append((sources, n))
         if not np.isfinite(weights.max()):
             raise ValueError("no state path has any probability")
@@ -92,29 +93,22 @@ def _start(*arrays: ArrayLike) -> tuple[np.ndarray, Iterator[tuple[np.ndarray, n
     return initial + ll[0], blocks(), transition
 
 
-@jax.jit
-def _sum(weights: Array, x: Array, transition: Array, n: Array) -> Array:
-    """Weights (num_states,) of all paths to each state, n rows further on."""
+@partial(jax.jit, static_argnames="best")
+def _pass(weights: Array, x: Array, transition: Array, n: Array, best: bool) -> tuple[Array, Array]:
+    """Weights (num_states,) of all paths to each state, or of the best, n rows further on.
 
-    def step(t: Array, weights: Array) -> Array:
-        return log_sum(weights[:, None] + transition, 0) + row(x, t)
-
-    return lax.fori_loop(jnp.int32(0), n, step, weights)
-
-
-@jax.jit
-def _best(weights: Array, x: Array, transition: Array, n: Array) -> tuple[Array, Array]:
-    """Weights (num_states,) of the best paths, n rows further on, and from where they came to each row."""
+    Also from where the best came to each row.
+    """
 
     def step(t: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        ways = carry[0][:, None] + transition
-        source = argmax(ways).astype(carry[1].dtype)
-        return ways.max(0) + row(x, t), lax.dynamic_update_index_in_dim(carry[1], source, t, 0)
+        ways, sources = carry[0][:, None] + transition, carry[1]
+        if not best:
+            return log_sum(ways, 0) + row(x, t), sources
+        sources = lax.dynamic_update_index_in_dim(sources, argmax(ways).astype(sources.dtype), t, 0)
+        return ways.max(0) + row(x, t), sources
 
-    few = x.shape[1] <= 256
-    return lax.fori_loop(
-        jnp.int32(0), n, step, (weights, jnp.zeros(x.shape, jnp.uint8 if few else jnp.int32))
-    )
+    sources = jnp.zeros(x.shape if best else (), jnp.uint8 if x.shape[1] <= 256 else jnp.int32)
+    return lax.fori_loop(jnp.int32(0), n, step, (weights, sources))
 
 
 @jax.jit

@@ -21,7 +21,7 @@ from jax import Array, lax
 from jax.tree_util import register_pytree_node_class
 from numpy.typing import ArrayLike
 
-from hmmseg.hmm.chain import InfeasibleAlignment, jumps_between
+from hmmseg.hmm.chain import InfeasibleAlignment, end_weights, jumps_between
 from hmmseg.hmm.recursions import NEVER, backwards, forwards, known, log_add, log_sum, numbers, pick, row
 
 RARE = 1e-12  # numerics: durations that are longer than all but this share are left out
@@ -75,16 +75,8 @@ class DurationChain:
         self.jumps = np.full((len(jumps), self.num_states), -np.inf)
         for weights, jump in zip(self.jumps, jumps, strict=True):
             weights[: jump.size] = jump
-        self.log_initial = self._end("log_initial", log_initial, initial)
-        self.log_final = self._end("log_final", log_final, final)
-
-    def _end(self, name: str, given: ArrayLike | None, otherwise: np.ndarray) -> np.ndarray:
-        end = np.asarray(otherwise if given is None else given, dtype=np.float64)
-        if end.shape != (self.num_states,):
-            raise ValueError(f"{name}: shape {end.shape}, expected {(self.num_states,)}")
-        if not end.max() < np.inf:
-            raise ValueError(f"{name}: {end.tolist()}, expected numbers or -inf")
-        return end
+        self.log_initial = end_weights("log_initial", log_initial, initial)
+        self.log_final = end_weights("log_final", log_final, final)
 
     def tree_flatten(self) -> tuple[tuple, None]:
         """The tables, for JAX."""

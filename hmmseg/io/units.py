@@ -139,11 +139,7 @@ class Column(Quantity):
         return sign
 
 
-def _by_name(value: Any) -> Any:
-    return {"from": value} if isinstance(value, str) else value
-
-
-ColumnEntry = Annotated[Column, BeforeValidator(_by_name)]
+ColumnEntry = Annotated[Column, BeforeValidator(lambda v: {"from": v} if isinstance(v, str) else v)]
 
 
 def _dimensions(entries: dict[str, Column]) -> dict[str, Column]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hmmseg.contact.decompose import FREE, UNITS, Subtask
+from hmmseg.segmentation.spans import Span
 
 if TYPE_CHECKING:
     from hmmseg.online.filter import Filter
@@ -142,15 +143,12 @@ class Answer:
         w = self._watcher
         first = w.first_t
         edges = [(first, 0.0), *((c.t, c.sd) for c in w.crossings), (self.t, 0.0)]
-        steps = [w.steps[0], *(c.step for c in w.crossings)]
-        out = []
+        out, steps = [], [w.steps[0], *(c.step for c in w.crossings)]
         for step, (start, sd), (end, end_sd) in zip(steps, edges, edges[1:], strict=False):
             end = max(start, end)
-            out.append({
-                "subtask": step.name, "object": step.object, "state": step.state, "start": start, "end": end,
-                "start_sd": sd, "end_sd": end_sd, "start_90": [start - Z90 * sd, start + Z90 * sd],
-                "end_90": [end - Z90 * end_sd, end + Z90 * end_sd],
-            })  # fmt: skip
+            own, after = ((t - Z90 * s, t + Z90 * s) for t, s in ((start, sd), (end, end_sd)))
+            span = Span(step.name, step.object, step.state, start, end, sd, end_sd, own, after)
+            out.append(span.to_json())
         return out
 
 

@@ -249,17 +249,13 @@ class Filter:
             mean, variance, come, early = boundary(s.rows, s.count, self.num_steps, s.settled, before)
             if early < 0.5 or come <= 0:
                 return
-            del self.crossings[s.settled :]
-            self.crossings.append(self._crossing(s.settled, mean, math.sqrt(variance)))
+            number, per_round, sd = s.settled, self.num_steps - 1, math.sqrt(variance)
+            del self.crossings[number:]
+            ended, begun = (self.steps[(n - 1) % per_round + 1 if n else 0] for n in (number, number + 1))
+            previous = self.crossings[-1].t if number else -math.inf
+            found = self._refined(ended, begun, previous, mean, sd)
+            self.crossings.append(Crossing(begun, number // per_round, *(found or (mean, sd))))
             s.settled += 1
-
-    def _crossing(self, number: int, mean: float, sd: float) -> Crossing:
-        """A boundary from the filter, or from the rows around it where these say it more finely."""
-        per_round = self.num_steps - 1
-        before, after = (self.steps[(number + k - 1) % per_round + 1 if number + k else 0] for k in (0, 1))
-        previous = self.crossings[number - 1].t if number else -math.inf
-        found = self._refined(before, after, previous, mean, sd)
-        return Crossing(after, number // per_round, *(found or (mean, sd)))
 
     def _refined(
         self, before: Subtask, after: Subtask, previous: float, mean: float, sd: float

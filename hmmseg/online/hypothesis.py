@@ -150,14 +150,10 @@ def widen(extremes, ranges, least, x):
     for k, value in enumerate((x.vx, x.vy, x.y, x.d)):
         if not math.isnan(value):
             extremes[k, 0], extremes[k, 1] = min(extremes[k, 0], value), max(extremes[k, 1], value)
-    span.vx, span.vy = (
-        max(least[0], extremes[0, 1] - extremes[0, 0]),
-        max(least[1], extremes[1, 1] - extremes[1, 0]),
-    )
-    span.y, span.d = (
-        max(least[2], extremes[2, 1] - extremes[2, 0]),
-        max(least[3], extremes[3, 1] - extremes[3, 0]),
-    )
+    span.vx = max(least[0], extremes[0, 1] - extremes[0, 0])
+    span.vy = max(least[1], extremes[1, 1] - extremes[1, 0])
+    span.y = max(least[2], extremes[2, 1] - extremes[2, 0])
+    span.d = max(least[3], extremes[3, 1] - extremes[3, 0])
     for c in range(4):
         if not math.isnan(x.force[c]):
             span.force = max(span.force, 1.5 * abs(x.force[c]))

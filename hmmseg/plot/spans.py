@@ -1,16 +1,19 @@
-"""Stacked panels over time with the subtasks of a segmentation behind them."""
+"""Signals, or any channels, stacked over time with the subtasks of a segmentation behind them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from hmmseg.plot.style import INK, state_colours
+from hmmseg.hand.signals import Signals
+from hmmseg.io.trial import Trial
+from hmmseg.plot.style import INK, canvas, state_colours
 from hmmseg.segmentation.spans import Segmentation
 
 LABEL_SLANT = 40  # look: degrees
@@ -72,3 +75,36 @@ def name_spans(ax: Axes, segmentation: Segmentation) -> None:
             textcoords="offset points", rotation=LABEL_SLANT, ha="left", va="bottom",
             rotation_mode="anchor", fontsize=7,
         )  # fmt: skip
+
+
+def draw_signals(signals: Signals, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
+    """Mean position, finger distance, grip, net and shear forces over coloured subtasks.
+
+    After the paper's Figures 5 to 7.
+    """
+    panels = [
+        Panel("Mean $x$\n[cm]", 100 * signals.x),
+        Panel("Mean $y$\n[cm]", 100 * signals.y),
+        Panel("Distance\n[cm]", 100 * signals.distance),
+        Panel("Grip\n[N]", signals.grip),
+        Panel("Net $f_x$\n[N]", signals.fx),
+        Panel("Net $f_y$\n[N]", signals.fy),
+        Panel("Shear\n[N]", signals.shear),
+    ]
+    with canvas(path, height=8.2) as figure:
+        return stacked_panels(figure, signals.t, panels, segmentation)
+
+
+MOST = 12  # look: panels that stay legible on one page
+
+
+def draw_channels(trial: Trial, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
+    """Every channel of a trial, the first twelve at most, over coloured subtasks, in its own units."""
+    names = list(trial.channels)[:MOST]
+    panels = [Panel(name, trial.channels[name]) for name in names]
+    with canvas(path, height=1.8 + 0.95 * len(panels)) as figure:
+        axes = stacked_panels(figure, trial.t, panels, segmentation)
+        left_out = len(trial.channels) - len(names)
+        if left_out:
+            axes[-1].set_xlabel(f"Time [s]   ({left_out} more channels not shown)")
+        return axes

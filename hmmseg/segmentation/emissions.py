@@ -193,14 +193,15 @@ def log_likelihoods(
     held = _log_held(features, parameters, force)
     names = dict.fromkeys(str(s.object) for s in subtasks if s.state != FREE)
     grips = {name: held + _log_width(features, parameters, name) for name in names}
-    keys = []  # contact state, object and resting level [m]: what the emission of a subtask depends on
+    # Contact state, object and resting level [m]: what the emission of a subtask depends on.
+    keys: list[tuple[str, str, float | None]] = []
     for s in subtasks:
         rests = s.state not in (FREE, ABOVE_GROUND) and bool(parameters.levels)
         level = parameters.levels[trial].get(s.index) if rests else None
         keys.append((s.state, "" if s.state == FREE else str(s.object), level))
     found = {
         key: free if key[0] == FREE
-        else _log_gripped(features, parameters, grips[key[1]], force, *key, stray)
+        else _log_gripped(features, parameters, grips[key[1]], force, *key, stray=stray)
         for key in dict.fromkeys(keys)
     }  # fmt: skip
     return np.stack([found[key] for key in keys], axis=1)
@@ -284,13 +285,10 @@ def thin(
     width = int(np.clip(min(window, 1.0) * rate, 1, group))
     thinned = {}
     for name, values in vars(signals).items():
-        if not isinstance(values, np.ndarray):
-            thinned[name] = values
-            continue
-        mean, count = grouped(values, group, width)
-        thinned[name] = mean / np.sqrt(np.maximum(count, 1)) if name.startswith("sd_") else mean
-    thinned["sd_force"] = signals.sd_force / np.sqrt(width)
-    return Signals(**thinned)
+        if isinstance(values, np.ndarray):
+            mean, count = grouped(values, group, width)
+            thinned[name] = mean / np.sqrt(np.maximum(count, 1)) if name.startswith("sd_") else mean
+    return replace(signals, **thinned, sd_force=signals.sd_force / np.sqrt(width))
 
 
 def acceleration(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:

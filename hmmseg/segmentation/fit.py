@@ -77,13 +77,15 @@ def mean_shares(gammas: Sequence[np.ndarray]) -> np.ndarray:
     return (counts + 1.0 / counts.size) / (counts.sum() + 1.0)
 
 
+Model = tuple[Parameters, np.ndarray]  # emissions, and shares (S,) of the trials' time
+
+
 def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Parameters | None = None) -> Fit:
     """Fit emissions and durations to the given trials, pooled, within the forced order.
 
     EM begins with `start`, or else with what `initial_parameters` makes of the trials.
     Raises `hmmseg.hmm.chain.InfeasibleAlignment` where a trial is too short for its subtasks.
     """
-    Model = tuple[Parameters, np.ndarray]
 
     def tables(model: Model) -> tuple[list[np.ndarray], list[Chain]]:
         parameters, shares = model
@@ -144,9 +146,7 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
         gamma = every[:, held].sum(axis=1)
         if not (np.isfinite(unsqueezed) & (gamma > 0)).any():
             continue  # never held where the distance is known
-        start = old.width.get(name, None)
-        if start is None:
-            start = weighted_median(unsqueezed, gamma)
+        start = old.width.get(name) or weighted_median(unsqueezed, gamma)
         width[name] = _location(unsqueezed, gamma, spread, start)
         residuals.append(unsqueezed - width[name])
         weights.append(gamma)

@@ -163,9 +163,13 @@ def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
 
 def _joined(s: Squeeze, clock: np.ndarray) -> np.ndarray:
     """Distances [m] at times [s] of cubic Hermite pieces through the samples with their rates."""
-    from scipy.interpolate import CubicHermiteSpline  # slow to import
-
-    return CubicHermiteSpline(s.t, s.distance, s.rate)(clock)
+    before = np.clip(np.searchsorted(s.t, clock, side="right") - 1, 0, s.t.size - 2)
+    width = np.diff(s.t)[before]
+    u = (clock - s.t[before]) / width
+    left, right = s.distance[before], s.distance[before + 1]
+    start, end = width * s.rate[before], width * s.rate[before + 1]
+    bend = start + end - 2 * (right - left)
+    return left + u * (start + u * (3 * (right - left) - 2 * start - end + u * bend))
 
 
 def _steps(clock: np.ndarray, num_steps: int) -> tuple[np.ndarray, np.ndarray]:

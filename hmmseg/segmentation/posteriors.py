@@ -65,9 +65,8 @@ class Contacts:
             making = after.state == ON_GROUND
             load = self._load(before, stretch, making)
             if self.signals.timing is not None:
-                timing = float(
-                    np.hypot(timing, np.median(self.signals.timing[stretch][:: 1 if making else -1][:2]))
-                )
+                nearest = self.signals.timing[stretch][:: 1 if making else -1][:2]
+                timing = float(np.hypot(timing, np.median(nearest)))
             return cut(Change((load,), prior, making, "impact" if making else "launch", timing))
         return None
 
@@ -174,13 +173,8 @@ def _rates(
     Where velocities are differences of positions, each side has its own.
     """
     if not s.derived:
-        rates, sinking = np.stack([s.vx1, -s.vx2]), -s.vy
-        return (
-            np.stack([rates, rates]),
-            np.stack([sinking, sinking]),
-            _sd(s.sd_vx, s.vx1),
-            _sd(s.sd_vy, s.vy1),
-        )
+        closing, noise = np.stack([s.vx1, -s.vx2]), (_sd(s.sd_vx, s.vx1), _sd(s.sd_vy, s.vy1))
+        return np.stack([closing, closing]), np.stack([-s.vy, -s.vy]), *noise
     (left, noise), (right, _), (rising, _) = (one_sided(s.t, x) for x in (*inward, s.y))
     return np.stack([left, right], axis=1), -rising, noise * sd_x, noise * sd_y
 
@@ -254,11 +248,8 @@ def to_spans(
     steps: tuple[Subtask, ...], boundaries: tuple[BoundaryPosterior, ...], first: float, last: float
 ) -> tuple[Span, ...]:
     """Spans between boundary medians, kept in order."""
-    medians = np.maximum.accumulate([first, *(b.quantile(0.5) for b in boundaries), last])
+    medians = np.maximum.accumulate([first, *(b.quantile(0.5) for b in boundaries), last]).tolist()
     sds = [0.0, *(b.sd for b in boundaries), 0.0]
     intervals = [(first, first), *(tuple(b.quantile(q) for q in INTERVAL) for b in boundaries), (last, last)]
-    return tuple(
-        Span(s.name, s.object, s.state, float(medians[i]), float(medians[i + 1]),
-             sds[i], sds[i + 1], intervals[i], intervals[i + 1])
-        for i, s in enumerate(steps)
-    )  # fmt: skip
+    ends = [each for pair in (medians, sds, intervals) for each in (pair[:-1], pair[1:])]
+    return tuple(Span(s.name, s.object, s.state, *rest) for s, *rest in zip(steps, *ends, strict=True))

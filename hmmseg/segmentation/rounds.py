@@ -76,13 +76,8 @@ class OnDisk:
             thin(self.part(slice(start, min(start + size, self.t.size))), max_rate, rate=rate)
             for start in range(0, self.t.size, size)
         ]
-        joined = {
-            name: np.concatenate([getattr(p, name) for p in pieces])
-            if isinstance(value, np.ndarray)
-            else value
-            for name, value in vars(pieces[0]).items()
-        }
-        return Signals(**joined)  # type: ignore[arg-type]
+        arrays = [name for name, value in vars(pieces[0]).items() if isinstance(value, np.ndarray)]
+        return replace(pieces[0], **{n: np.concatenate([getattr(p, n) for p in pieces]) for n in arrays})
 
 
 Recorded = InMemory | OnDisk
@@ -157,8 +152,8 @@ def slices(t: np.ndarray, cuts: Sequence[float]) -> list[slice]:
 
 def part(signals: Signals, samples: slice) -> Signals:
     """A stretch of a recording."""
-    sliced = {k: v[samples] if isinstance(v, np.ndarray) else v for k, v in vars(signals).items()}
-    return Signals(**sliced)  # type: ignore[arg-type]
+    sliced = {k: v[samples] for k, v in vars(signals).items() if isinstance(v, np.ndarray)}
+    return replace(signals, **sliced)
 
 
 def merge_point(verdicts: Sequence[Conformity], times: Sequence[np.ndarray]) -> int | None:

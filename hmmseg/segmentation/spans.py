@@ -161,8 +161,7 @@ class Segmentation(Tabled):
         """
         if self.recorded is None:
             raise ValueError("this segmentation keeps no recording to plot")
-        from hmmseg.plot.channels import draw_channels
-        from hmmseg.plot.signals import draw_signals
+        from hmmseg.plot.spans import draw_channels, draw_signals
 
         draw = draw_signals if hasattr(self.recorded, "grip") else draw_channels
         return draw(self.recorded, self, None if path is None else Path(path))

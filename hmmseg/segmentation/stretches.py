@@ -81,7 +81,7 @@ def find(readings: Sequence[Reading]) -> Toe:
     # Loads and values (num_stretches, N) of all stretches, and which are there; the rest is 0.
     sizes = np.array([load.size for load, *_ in readings])
     there = np.arange(sizes.max()) < sizes[:, None]
-    load, value = np.zeros((2, *there.shape))
+    load, value = np.zeros(there.shape), np.zeros(there.shape)
     load[there], value[there] = (np.concatenate([r[i] for r in readings]) for i in range(2))
     straight = _depths(load, value, np.zeros((1, *load.shape)), there, usual)[1]
     scale = max(usual, robust_sd(straight[0][there]))

@@ -217,10 +217,8 @@ def _spans(t: np.ndarray, steps: tuple[Subtask, ...], assigned: Assignment) -> t
     begin = [t[0], *t[assigned.last[shown[:-1]]], t[-1]]  # the interval each boundary lies in
     end = [t[0], *t[assigned.first[shown[1:]]], t[-1]]
     middle, width = np.add(begin, end) / 2, np.subtract(end, begin)
-    sd = width / math.sqrt(12)
-    interval = [(float(m - 0.45 * w), float(m + 0.45 * w)) for m, w in zip(middle, width, strict=True)]
-    return tuple(
-        Span(steps[s].name, steps[s].object, steps[s].state, float(middle[i]), float(middle[i + 1]),
-             float(sd[i]), float(sd[i + 1]), interval[i], interval[i + 1])
-        for i, s in enumerate(shown)
-    )  # fmt: skip
+    interval = [(m - 0.45 * w, m + 0.45 * w) for m, w in zip(middle.tolist(), width.tolist(), strict=True)]
+    every = middle.tolist(), (width / math.sqrt(12)).tolist(), interval
+    ends = [each for pair in every for each in (pair[:-1], pair[1:])]
+    own = [steps[s] for s in shown]
+    return tuple(Span(s.name, s.object, s.state, *rest) for s, *rest in zip(own, *ends, strict=True))

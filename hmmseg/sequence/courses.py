@@ -262,9 +262,17 @@ def naming(
 
     `labels` [(num_states - 1,), ...] of each trial: known boundaries as shares of it, NaN where unknown.
     """
-    groups, tail, end = _weights(course, weighing)
+    # Log weights of stretches a <= k < b as one named state [a, b], of those from a on as the last [a], and
+    # as the last followed by a settled one from e on [a, e]; of a change as an end of a state, seen or not.
+    temper = weighing.independent * course.share / (weighing.independent + course.observations)
+    evidence = np.where(np.isfinite(course.cost), -temper * course.cost, -np.inf)
+    edges = np.column_stack([np.zeros(len(course.ends)), course.ends, np.ones(len(course.ends))])
+    shares = np.maximum(edges[:, None] - edges[:, :, None], LEAST_SHARE)
+    change = np.logaddexp(np.log1p(-weighing.unseen) + course.seen, np.log(weighing.unseen))
+    groups = evidence + weighing.shares * np.log(shares).mean(0)
+    end = evidence + evidence[:, -1] + weighing.settled + np.r_[0.0, change, 0.0]
+    tail = np.logaddexp(evidence[:, -1], _sum(end, 1))
     at = label_weights(course, labels, weighing)
-    change = _change_weights(course, weighing)
     at[:, 1:-1] += change
     ahead = [groups[0] + at[0]]
     for b in range(1, num_states - 1):
@@ -280,23 +288,6 @@ def naming(
     for each in change:
         choices[1:] = np.logaddexp(choices[1:], choices[:-1] + each)
     return Naming(total - float(choices[-1]), np.exp(joint - total), last)
-
-
-def _change_weights(course: Course, weighing: Weighing) -> np.ndarray:
-    """Log weight (num_changes,) of each change as an end of a state: that it is seen, or is one unseen."""
-    return np.logaddexp(np.log1p(-weighing.unseen) + course.seen, np.log(weighing.unseen))
-
-
-def _weights(course: Course, weighing: Weighing) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Log weights of stretches a <= k < b as one named state [a, b], of those from a on as the last [a], and
-    as the last followed by a settled one from e on [a, e]."""
-    temper = weighing.independent * course.share / (weighing.independent + course.observations)
-    evidence = np.where(np.isfinite(course.cost), -temper * course.cost, -np.inf)
-    edges = np.column_stack([np.zeros(len(course.ends)), course.ends, np.ones(len(course.ends))])
-    durations = np.maximum(edges[:, None] - edges[:, :, None], LEAST_SHARE)
-    groups = evidence + weighing.shares * np.log(durations).mean(0)
-    end = evidence + evidence[:, -1] + weighing.settled + np.r_[0.0, _change_weights(course, weighing), 0.0]
-    return groups, np.logaddexp(evidence[:, -1], _sum(end, 1)), end
 
 
 def label_weights(course: Course, labels: Sequence[np.ndarray], weighing: Weighing) -> np.ndarray:

@@ -273,7 +273,8 @@ def _fit_labelled(data: list[SequenceFeatures], task: SequenceTask, mapping: Fea
     probability = [np.eye(len(optional))[path] for _, _, path in own]
     emissions = taught.tempered(taught.emissions(probability, FLOORS[-1], 1.0), probability)
     law = taught.law(probability)
-    detectors = choose_detectors(taught, *zip(*own, strict=True), emissions.temper, law)
+    mine = [d for d, _, _ in own], [b for _, b, _ in own], [path for _, _, path in own]
+    detectors = choose_detectors(taught, *mine, temper=emissions.temper, law=law)
     allowed = [None if labelled else forbidden(d, b, len(optional))
                for d, b, labelled in zip(data, boundaries, whole, strict=True)]  # fmt: skip
     learner = Learner([d.values for d in data], task.sequence, optional, known=paths, allowed=allowed)

@@ -13,8 +13,6 @@ from simgap.attribution.heldout import (
     POSITIVE,
     Heldout,
     HowFar,
-    Invariance,
-    invariance,
     residual_left,
     scatter_between,
 )
@@ -50,14 +48,13 @@ class ParameterPosterior:
 @dataclass(frozen=True)
 class EffectPosterior:
     """One effect: `probability` to act, `share` of the gap it explains with its 90 % interval (0 where it
-    does not act), parameters, whether they are the same in all trials, and which of the gap's candidates (an
-    effect may have several forms) they are of."""
+    does not act), parameters, and which of the gap's candidates (an effect may have several forms) they are
+    of."""
 
     probability: float
     share: float
     share_90: tuple[float, float]
     parameters: dict[str, ParameterPosterior]
-    invariance: Invariance | None
     candidate: int
 
 
@@ -152,7 +149,6 @@ def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap
 
 
 DOUBT = 0.1  # chosen: chance of no cause or another one, beyond which a gap usually tolerated is left
-SPREAD = 0.9  # numerics: share of a parameter's squares in one part from which on it acts in no other
 EXAMINED = 6  # numerics: sets that are examined for being the cause
 
 
@@ -268,12 +264,11 @@ def _forced(f: Forms, names: tuple[str, ...]) -> Model:
 
 @dataclass(frozen=True)
 class _Examined:
-    """A set of named effects: its fit, shares, invariance, `causes` that matter, probability to be right."""
+    """A set of effects: its fit, shares, `causes` that matter, probability to be right."""
 
     effects: tuple[int, ...]
     model: Model
     shares: Shares
-    invariance: dict[int, Invariance]
     causes: tuple[int, ...]
     known: float
 
@@ -289,36 +284,18 @@ def _examined(
     """`others`: trials predicted by the others; a cause must predict them better than the set without it."""
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
-    same = {j: _same(f, model, j) for j in effects}
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
-    causes = tuple(
-        j
-        for j in effects
-        if j in scattering
-        or (_needed(f, model, j) and same[j].log_bayes_factor > POSITIVE and _there(f, model, j))
-    )
+    causes = tuple(j for j in effects if j in scattering or _needed(f, model, j))
     if others is not None:
         causes = _predicting(others, causes)
-    shifting = [same[j] for j in causes if j not in scattering]
+    shifting = {*causes} - scattering
     left = explained.inside if shifting else 0.0
-    factors = [i.log_bayes_factor for i in shifting]
     far = others.how_far(causes) if others is not None and causes else None
     share = 1 - explained.remainder if far is None else far.fraction
     if far is None and others is not None and shifting:
         share = 0.0  # squares in all are no more than the noise's: there is nothing that could be gone
-    sure = known(left, share, factors, detected(statistic(f, models, causes)).p_value) if causes else 0.0
-    return _Examined(effects, model, explained, same, causes, sure)
-
-
-def _same(f: Forms, model: Model, effect: int) -> Invariance:
-    """Whether an effect is the same in all trials, and of `parts_alike` in all parts: the weaker evidence."""
-    gap = f.gap
-    found = [invariance(f, model, effect, gap.rows.trial)]
-    by = [np.bincount(gap.rows.part, push**2) for push in gap.candidates[effect].jacobian.T]
-    if gap.parts_alike and any(each.max() < SPREAD * each.sum() for each in by):
-        by_part = invariance(f, model, effect, gap.rows.part)
-        found = [by_part] if np.isnan(found[0].wander) else [*found, by_part]
-    return min(found, key=lambda one: one.log_bayes_factor)
+    sure = known(left, share, detected(statistic(f, models, causes)).p_value) if causes else 0.0
+    return _Examined(effects, model, explained, causes, sure)
 
 
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
@@ -341,16 +318,6 @@ def _needed(f: Forms, model: Model, effect: int) -> bool:
         return True
     feigned = max(f.gap.candidates[j].form for j in others) * (model.score - fitted(f, ()).score)
     return model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned)
-
-
-def _there(f: Forms, model: Model, effect: int) -> bool:
-    """Whether an effect acts by itself: what it frees may be off for other reasons, and is no sign of it."""
-    if f.gap.candidates[effect].frees is None:
-        return True
-    own = coordinates(f, model.effects)[effect]
-    own = own[~model.at_bound[own]]
-    x, covariance = model.x[own], model.covariance[np.ix_(own, own)]
-    return 0.5 * float(x @ np.linalg.solve(covariance, x)) > POSITIVE
 
 
 def _effects(
@@ -378,13 +345,12 @@ def _effects(
         own = coordinates(f, model.effects)[j]
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
-        same = None if found is None else found.invariance[j]
         # Parts are compared for effects of the sets that were examined alone.
         wide = sd if found is None else np.hypot(sd, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,
             {n: ParameterPosterior(float(m), float(s), (float(m - 1.645 * s), float(m + 1.645 * s)))
-             for n, m, s in zip(c.parameters, mean, wide, strict=True)}, same, j)  # fmt: skip
+             for n, m, s in zip(c.parameters, mean, wide, strict=True)}, j)  # fmt: skip
     return out
 
 

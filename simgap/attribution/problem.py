@@ -102,7 +102,6 @@ class Gap:
     from the same recording as the residual. `tolerance` (n,): smallest shift of each row that matters, in sds
     of its noise; where it is `usual`, nobody's own, a cause that is found matters all the same. `told` (n,):
     the mean square of a row if nothing acts, 1 where it is not given: repeats of one motion share an error.
-    `parts_alike`: whether a cause must be the same in all parts, too, and not only in all trials.
     """
 
     rows: Rows
@@ -115,7 +114,6 @@ class Gap:
     tolerance: Float[np.ndarray, " n"] | None = None
     usual: bool = False
     told: Float[np.ndarray, " n"] | None = None
-    parts_alike: bool = False
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
@@ -123,7 +121,7 @@ class Gap:
                    tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
                    None if self.carried is None else self.carried[:, rows],
                    None if self.tolerance is None else self.tolerance[rows], self.usual,
-                   None if self.told is None else self.told[rows], self.parts_alike)  # fmt: skip
+                   None if self.told is None else self.told[rows])  # fmt: skip
 
     def only(self, effects: Sequence[int]) -> Gap:
         """The gap with some of its candidates alone, in this order."""

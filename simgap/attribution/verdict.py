@@ -118,18 +118,15 @@ def acting(sets: Sequence[Explanation], p_value: float) -> dict[str, float]:
     return {name: min(value, 1.0) for name, value in out.items()}  # a sum of many is rounded
 
 
-def known(left: float, explained: float, same: Iterable[float] = (), p_rest: float = 0.0) -> float:
-    """Probability that a set's effects are the cause: they leave little, and are the same everywhere.
+def known(left: float, explained: float, p_rest: float = 0.0) -> float:
+    """Probability that a set's effects are the cause: they leave little.
 
     `left`: share of the gap that the set leaves where it acts, `explained`: what it explains of all of it in
     trials that took no part. Logistic in the logarithm of the larger share that is left, as far as anything
     is: `p_rest` is the chance of noise to look like what is left, for of a small gap no share is certain.
-    `same`: log Bayes factors of each effect, one cause against as many as there are parts: an effect whose
-    parameters wander is as likely an imitation as its factor says.
     """
     most = expit(np.log(MOST / max(left, 1 - explained, 1e-6)) / WIDTH)
-    most = 1 - (1 - healthy(p_rest)) * (1 - most)
-    return float(most * min((expit(factor) for factor in same), default=1.0))
+    return float(1 - (1 - healthy(p_rest)) * (1 - most))
 
 
 def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:

@@ -6,7 +6,8 @@ ways in which whole trials differ (offset, slope, size, time) and an autocorrela
 & Ware, Biometrics 38, 1982) by moments. Rows are whitened by its symmetric root, which leaves every row
 closest to its own feature (Kessy, Lewin & Strimmer, Am. Stat. 72, 2018). All real trials share the error of
 the simulated mean, S trials of covariance B: for R real ones of covariance A, rows are whitened by
-A + B R / S, so that their mean is known as well as it is; `Block.expected` has their mean square, below one.
+A + B R / S, so that their mean is known as well as it is, and their mean square is below one
+(`Whitening.expected`).
 
 Whether there is a gap is judged by exchanging the labels real and simulated (Besag & Clifford, Biometrika 78,
 1991): exchanged trials are healthy twins.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from math import comb
 from typing import Any
@@ -100,8 +102,7 @@ def diagnose(
         models = sought(forms(gap))
         leading = tuple(gap.candidates[j].name for j in models[0].effects)
         if len(leading) > 1:
-            joint = fit(given, white, real.mean(0) - sim.mean(0), leading)
-            more = _joint(given, white, joint, len(real))
+            more = _joint(given, white, fit(given, white, real, sim, leading), len(real))
             gap, models = replace(gap, candidates=(*gap.candidates, *more)), None
     tell("attributing the gap")
 
@@ -112,13 +113,11 @@ def diagnose(
     return _document(given, gap, white, verdict, real, sim)
 
 
-def searched(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[tuple[Block, ...], Gap]:
+def searched(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Whitening, Gap]:
     """The gap with every effect fitted by itself, and what whitens it."""
     white = whitening(given, real, sim)
-    found = [fit(given, white, real.mean(0) - sim.mean(0), (n,)) for n in effects()]
-    return white, gap_of(
-        given.layout, white, real, sim, [c for f in found for c in _candidates(white, f, len(real))]
-    )
+    found = (_candidates(white, fit(given, white, real, sim, (n,)), len(real)) for n in effects())
+    return white, gap_of(given.layout, white, real, sim, [c for forms in found for c in forms])
 
 
 def _exchanged(given: Scene, real: np.ndarray, sim: np.ndarray, seed: int) -> Iterator[float]:
@@ -137,33 +136,30 @@ def _exchanged(given: Scene, real: np.ndarray, sim: np.ndarray, seed: int) -> It
 
 
 @dataclass(frozen=True)
-class Block:
-    """Features of one channel (-1: durations): their indices (n,), `root` (n, n) that whitens rows of the
-    gap of so many real `trials`, variances (n,) of a row, and mean square (n,) of a whitened one."""
+class Whitening:
+    """Of a row of the gap: the `root` (F, F) that whitens it, channel by channel, its variances (F,), and the
+    mean squares (F,) of the whitened one."""
 
-    channel: int
-    index: np.ndarray
     root: np.ndarray
     variance: np.ndarray
     expected: np.ndarray
-    trials: int
 
 
-def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Block, ...]:
-    """A block for every channel and one for durations."""
+def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> Whitening:
+    """What whitens the rows of the gap of so many real trials."""
     lay, kinds = given.layout, [v for v in (real, sim) if len(v) > 1]
-    out = []
-    for c in (*range(len(lay.ensembles.channels)), -1):
+    root, (variance, expected) = np.zeros((lay.kind.size, lay.kind.size)), np.zeros((2, lay.kind.size))
+    for c in lay.every:
         index = lay.of_channel(c)
         basis = _common(given, c) if c >= 0 else np.zeros((index.size, 0))
         each = [_covariance(lay, v[:, index], basis, index) for v in kinds]
         a, b = each[0], each[-1]  # a single trial borrows the other kind's
         of_row = a + b * len(real) / len(sim)
         values, vectors = np.linalg.eigh(of_row)
-        root = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))) @ vectors.T
-        expected = np.einsum("ij,jk,ik->i", root, a + b / len(sim), root)
-        out.append(Block(c, index, root, np.diag(of_row), expected, len(real)))
-    return tuple(out)
+        own = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))) @ vectors.T
+        root[np.ix_(index, index)], variance[index] = own, np.diag(of_row)
+        expected[index] = np.einsum("ij,jk,ik->i", own, a + b / len(sim), own)
+    return Whitening(root, variance, expected)
 
 
 def variances(lay: Layout, deviations: np.ndarray, index: np.ndarray) -> np.ndarray:
@@ -218,7 +214,7 @@ def _covariance(lay: Layout, values: np.ndarray, basis: np.ndarray, index: np.nd
 
 
 def gap_of(
-    lay: Layout, white: Sequence[Block], real: np.ndarray, sim: np.ndarray, candidates: Sequence[Candidate]
+    lay: Layout, white: Whitening, real: np.ndarray, sim: np.ndarray, candidates: Sequence[Candidate]
 ) -> Gap:
     """The gap of all real trials; it has no nuisances, as the covariance holds them."""
     count, c = len(real), len(lay.ensembles.channels)
@@ -233,20 +229,9 @@ def gap_of(
         np.tile(time, count), tuple(cut.trial.file for cut in lay.ensembles.real[:count]),
         (*names, *(n + POWER for n in names), DURATIONS), lay.ensembles.subtasks,
     )  # fmt: skip
-    expected = np.zeros(lay.kind.size)
-    for block in white:
-        expected[block.index] = block.expected
-    residual = np.concatenate([_whitened(white, row) for row in real - sim.mean(0)])
+    residual = ((real - sim.mean(0)) @ white.root.T).ravel()
     return Gap(parts, residual, np.zeros((residual.size, 0)), tuple(candidates),
-               told=np.tile(expected, count), parts_alike=True)  # fmt: skip
-
-
-def _whitened(white: Sequence[Block], values: np.ndarray) -> np.ndarray:
-    """Rows of one trial from features (F, ...)."""
-    out = np.zeros_like(values, float)
-    for block in white:
-        out[block.index] = block.root @ values[block.index]
-    return out
+               told=np.tile(white.expected, count))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -260,40 +245,44 @@ class Part:
     slopes: np.ndarray
 
 
-def shift_at(given: Scene, block: Block, mine: Sequence[Slot], u: np.ndarray) -> np.ndarray:
-    """Features (n,) of a block with effects at coordinates u, less those without."""
+def shift_at(given: Scene, mine: Sequence[Slot], u: np.ndarray) -> np.ndarray:
+    """Features (n,) of a channel, or durations, with effects at coordinates u, less those without."""
     values = [s.parameter.value(float(v)) for s, v in zip(mine, u, strict=True)]
-    if block.channel < 0:
-        return np.bincount([s.place for s in mine], values, block.index.size)
-    acting, rung = dict[str, dict[str, float]](), np.zeros((len(given.layout.window), 2))
+    count = len(given.layout.window)
+    if mine[0].channel < 0:
+        return np.bincount([s.place for s in mine], values, count)
+    acting, rung = dict[str, dict[str, float]](), np.zeros((count, 2))
     for s, value in zip(mine, values, strict=True):
         if s.place >= 0:
             rung[s.place, int(s.parameter.name == "cos")] = value
         else:
             acting.setdefault(s.effect, {})[s.parameter.name] = value
-    return predicted(given, block.channel, acting, rung) - given.plain[block.channel]
+    return predicted(given, mine[0].channel, acting, rung) - given.plain[mine[0].channel]
 
 
-def fit(given: Scene, white: Sequence[Block], difference: np.ndarray, names: Sequence[str]) -> list[Part]:
-    """Effects together fitted to the mean difference (F,), channel by channel, from every start.
+def fit(
+    given: Scene, white: Whitening, real: np.ndarray, sim: np.ndarray, names: Sequence[str]
+) -> list[Part]:
+    """Effects together fitted to the mean difference of features, channel by channel, from every start.
 
     What runs to the end of its range is left out: a filter of half a second stands for a course that differs
     in another way, and is none of this channel's.
     """
-    out = []
-    for block in white:
-        mine, inside = [s for name in names for s in slots(given, name, block.channel)], [False]
+    out, difference = [], real.mean(0) - sim.mean(0)
+    for channel in given.layout.every:
+        index = given.layout.of_channel(channel)
+        root = white.root[np.ix_(index, index)] * np.sqrt(len(real))
+        mine, inside = [s for name in names for s in slots(given, name, channel)], [False]
         while mine and not all(inside):
-            u, slopes = _fitted(given, block, difference[block.index], mine)
+            u, slopes = _fitted(given, root, difference[index], mine)
             inside = [not _ended(s.parameter, v) for s, v in zip(mine, u, strict=True)]
             if not all(inside):
                 mine = [s for s, kept in zip(mine, inside, strict=True) if kept]
         every = list(range(len(mine)))
         # Durations are judged one by one.
-        for part in ([every] if block.channel >= 0 else [[k] for k in every]) if mine else ():
+        for part in ([every] if channel >= 0 else [[k] for k in every]) if mine else ():
             own, whole = tuple(mine[k] for k in part), np.zeros((difference.size, 1 + len(part)))
-            whole[block.index, 0] = shift_at(given, block, own, u[part])
-            whole[block.index, 1:] = slopes[:, part]
+            whole[index, 0], whole[index, 1:] = shift_at(given, own, u[part]), slopes[:, part]
             out.append(Part(own, u[part], whole[:, 0], whole[:, 1:]))
     return out
 
@@ -304,15 +293,12 @@ def _ended(p: Parameter, value: float) -> bool:
 
 
 def _fitted(
-    given: Scene, block: Block, target: np.ndarray, mine: Sequence[Slot]
+    given: Scene, root: np.ndarray, target: np.ndarray, mine: Sequence[Slot]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates (k,) and derivatives (n, k) of the best of all starts, by least squares within bounds and
     with normal priors."""
-    root, priors = block.root * np.sqrt(block.trials), np.eye(len(mine))
-    ends = np.array([s.parameter.limits for s in mine]).T
-
-    def at(u: np.ndarray) -> np.ndarray:
-        return shift_at(given, block, mine, u)
+    priors, ends = np.eye(len(mine)), np.array([s.parameter.limits for s in mine]).T
+    at = partial(shift_at, given, mine)
 
     def push(u: np.ndarray) -> np.ndarray:
         return (np.stack([at(u + step) for step in STEP * priors], 1) - at(u)[:, None]) / STEP
@@ -331,45 +317,44 @@ def _fitted(
     return u, push(u)
 
 
-def _candidates(white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:
+def _candidates(white: Whitening, found: Sequence[Part], count: int) -> list[Candidate]:
     """One effect in all channels (or subtasks, of durations), and in that alone in which it explains most."""
     if not found:
         return []
-    gains = [float(np.square(_whitened(white, p.shift)).sum()) for p in found]
+    gains = [float(np.square(white.root @ p.shift).sum()) for p in found]
     forms = [list(found)] + [[found[int(np.argmax(gains))]]] * (len(found) > 1)
     return [_candidate(white, parts, np.sum([p.shift for p in parts], 0), count) for parts in forms]
 
 
-def _joint(given: Scene, white: Sequence[Block], found: Sequence[Part], count: int) -> list[Candidate]:
+def _joint(given: Scene, white: Whitening, found: Sequence[Part], count: int) -> list[Candidate]:
     """The effects of a joint fit as candidates where they are together: of each what is gone without it; what
     they do only together is parted evenly."""
-    blocks = {b.channel: b for b in white}
     names = list(dict.fromkeys(s.effect for p in found for s in p.slots))
-    whole, alone, own = np.sum([p.shift for p in found], 0), {}, {}
+    lay, whole, alone, own = given.layout, np.sum([p.shift for p in found], 0), {}, {}
     for name in names:
         alone[name], own[name] = np.zeros_like(whole), list[Part]()
         for p in found:
-            mine, block = np.array([s.effect == name for s in p.slots]), blocks[p.slots[0].channel]
+            mine, index = np.array([s.effect == name for s in p.slots]), lay.of_channel(p.slots[0].channel)
             if mine.any():
-                rest = shift_at(given, block, p.slots, np.where(mine, 0.0, p.u))
-                alone[name][block.index] += p.shift[block.index] - rest
+                rest = shift_at(given, p.slots, np.where(mine, 0.0, p.u))
+                alone[name][index] += p.shift[index] - rest
                 kept = tuple(s for s in p.slots if s.effect == name)
                 own[name].append(Part(kept, p.u[mine], p.shift, p.slopes[:, mine]))
     more = (whole - np.sum(list(alone.values()), 0)) / len(names)
     return [_candidate(white, own[name], alone[name] + more, count) for name in names]
 
 
-def _candidate(white: Sequence[Block], parts: Sequence[Part], shift: np.ndarray, count: int) -> Candidate:
+def _candidate(white: Whitening, parts: Sequence[Part], shift: np.ndarray, count: int) -> Candidate:
     mine, u = [s for p in parts for s in p.slots], np.concatenate([p.u for p in parts])
     slopes = np.concatenate([p.slopes for p in parts], 1)
     low, high = np.array([s.parameter.limits for s in mine]).T
+    moved, pushed = np.tile(white.root @ shift, count), np.tile(white.root @ slopes, (count, 1))
     return Candidate(mine[0].effect, tuple(s.label for s in mine), u, np.zeros(u.size), np.ones(u.size),
-                     np.tile(_whitened(white, shift), count), np.tile(_whitened(white, slopes), (count, 1)),
-                     low, high)  # fmt: skip
+                     moved, pushed, low, high)  # fmt: skip
 
 
 def _document(
-    given: Scene, gap: Gap, white: Sequence[Block], verdict: Attribution, real: np.ndarray, sim: np.ndarray
+    given: Scene, gap: Gap, white: Whitening, verdict: Attribution, real: np.ndarray, sim: np.ndarray
 ) -> GenericDiagnosis:
     """The JSON document, and what figures need."""
     lay, far, rest = given.layout, verdict.how_far, verdict.remainder
@@ -386,16 +371,14 @@ def _document(
     warnings = [*lay.ensembles.warnings]
     if len(real) == 1:
         warnings.append("one real trial: nothing is held out, and an accident of it looks like an effect")
-    shift, variance, moved = (np.zeros(lay.kind.size) for _ in range(3))
+    moved = np.zeros(lay.kind.size)
     for n in leading:
         e = verdict.effects[n]
         c = gap.candidates[e.candidate]
         x = np.array([p.mean for p in e.parameters.values()])
         moved += (c.shift + c.jacobian @ (x - c.at))[: lay.kind.size]
-    for block in white:
-        shift[block.index] = np.linalg.solve(block.root, moved[block.index])
-        variance[block.index] = block.variance
-    return GenericDiagnosis(body, given, verdict, real, sim, variance, shift, leading, tuple(warnings))
+    shift = np.linalg.solve(white.root, moved)
+    return GenericDiagnosis(body, given, verdict, real, sim, white.variance, shift, leading, tuple(warnings))
 
 
 def _cells(lay: Layout, found: Sequence[Any]) -> list[dict[str, Any]]:
@@ -426,7 +409,7 @@ def _parameters(given: Scene, name: str, found: Mapping[str, ParameterPosterior]
     """An effect's parameters in units, by channel or subtask; of a vibration frequency, damping and size."""
     lay, out = given.layout, dict[str, Any]()
     rung = dict[tuple[int, int], list[tuple[float, float]]]()
-    of = {s.label: s for c in (*range(len(lay.ensembles.channels)), -1) for s in slots(given, name, c)}
+    of = {s.label: s for c in lay.every for s in slots(given, name, c)}
     for label, value in found.items():
         slot, p = of[label], of[label].parameter
         mean, sd, ends = p.value(value.mean), p.sd * value.sd, [p.value(v) for v in value.interval_90]

@@ -119,8 +119,9 @@ def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
         each = np.array([refined(np.delete(windows, i, 0), best) for i in range(n)])
         sd = np.sqrt((n - 1) / n * ((each - each.mean(0)) ** 2).sum(0))
         reach = -float(stdtrit(n - 1, 0.05))
-    both_90 = ((float(a), float(b)) for a, b in np.exp(best + np.outer([-reach, reach], sd)).T)
-    return Ring(*map(float, np.exp(best)), *map(float, np.exp(best) * sd), *both_90)
+    (frequency, damping), low, high = np.exp(best), np.exp(best - reach * sd), np.exp(best + reach * sd)
+    return Ring(float(frequency), float(damping), float(frequency * sd[0]), float(damping * sd[1]),
+                (float(low[0]), float(high[0])), (float(low[1]), float(high[1])))  # fmt: skip
 
 
 def _range(windows: np.ndarray, rate: float) -> tuple[float, float]:

@@ -201,15 +201,14 @@ class Layout:
         """Power (C,) below which a channel's is no different from none."""
         return (FLOOR * self.scale) ** 2
 
-    def where(self, kind: int, channel: int, subtask: int) -> np.ndarray:
-        """Indices of the features of one kind in a channel and subtask."""
-        return np.flatnonzero((self.kind == kind) & (self.channel == channel) & (self.subtask == subtask))
+    @property
+    def every(self) -> tuple[int, ...]:
+        """All channels, and -1 of durations."""
+        return (*range(len(self.ensembles.channels)), -1)
 
     def of_channel(self, channel: int) -> np.ndarray:
         """Indices of a channel's features: slow ones of all subtasks, then fast ones; of -1 the durations."""
-        every = range(len(self.window))
-        kinds = (SLOW, FAST) if channel >= 0 else (DURATION,)
-        return np.concatenate([self.where(kind, channel, k) for kind in kinds for k in every])
+        return np.flatnonzero(self.channel == channel)
 
 
 def layout(given: Ensembles) -> Layout:
@@ -227,11 +226,11 @@ def layout(given: Ensembles) -> Layout:
     bins = np.clip(shortest * rate // 4, 1, BINS).astype(int)
     lowest = np.maximum(LOWEST, np.ceil(window * bins / (shortest * rate)).astype(int))
     subs = tuple(_sub_bands(int(low), int(n)) for low, n in zip(lowest, window, strict=True))
-    rows = []
-    for k in range(len(given.subtasks)):
-        for c in range(len(given.channels)):
-            rows += [(c, k, SLOW, 1)] * bins[k] + [(c, k, FAST, s.stop - s.start) for s in subs[k]]
-        rows.append((-1, k, DURATION, 1))
+    rows, every = [], range(len(given.subtasks))
+    for c in range(len(given.channels)):
+        rows += [(c, k, SLOW, 1) for k in every for _ in range(bins[k])]
+        rows += [(c, k, FAST, s.stop - s.start) for k in every for s in subs[k]]
+    rows += [(-1, k, DURATION, 1) for k in every]
     scale = np.where(spread > 0, spread, 1.0)
     return Layout(given, rate, scale, event, window, subs, bins, *np.array(rows).T)
 

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
 from simgap.generic.diagnose import GenericDiagnosis
-from simgap.generic.trials import SLOW
 from simgap.report.finding import CHANNELS, by_place, chances, plain_name, share_of
 from simgap.report.robot import Course, Own, courses
 from simgap.robots.changes import Changes
@@ -162,10 +161,12 @@ def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:
     """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
     lay = found.scene.layout
     excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
-    courses = [(c, k) for c in range(len(lay.ensembles.channels)) for k in range(len(lay.ensembles.subtasks))]
-    channel, worst = max(courses, key=lambda cell: excess[lay.where(SLOW, *cell)].mean())
-    index = np.concatenate([lay.where(SLOW, channel, k) for k in range(len(lay.ensembles.subtasks))])
     t = (found.scene.bins[1:] + found.scene.bins[:-1]) / 2
+    slow = [lay.of_channel(c)[: t.size] for c in range(len(lay.ensembles.channels))]
+    starts = np.cumsum([0, *lay.bins[:-1]])
+    mean = np.add.reduceat(excess[slow], starts, 1) / lay.bins  # (channels, subtasks)
+    channel, worst = np.unravel_index(mean.argmax(), mean.shape)
+    index = slow[channel]
     real, sim = found.real[:, index], found.sim[:, index]
     with canvas(path, height=3.8) as figure:
         above, below = figure.subplots(2, 1, sharex=True)

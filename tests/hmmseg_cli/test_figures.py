@@ -14,8 +14,7 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
 from hmmseg.plot import style as drawing
-from hmmseg.plot.channels import MOST, draw_channels
-from hmmseg.plot.signals import draw_signals
+from hmmseg.plot.spans import MOST, draw_channels, draw_signals
 from hmmseg.segmentation.spans import Failure, Segmentation, Span
 
 T = np.arange(100) * 0.05

@@ -91,7 +91,7 @@ def test_predicted_shifts_are_those_of_changed_simulated_trials(name, shift):
     other = layout(align(real, [changed(t) for t in sim], TASK, boundaries=boundaries))
     given, effect = scene(plain), {"rate": "force_drift"}.get(name, f"force_{name}")
     guess = predicted(given, 0, {effect: {name: shift}}) - predicted(given, 0, {})
-    slow = np.concatenate([plain.where(SLOW, 0, k) for k in range(3)])
+    slow = plain.of_channel(0)[: plain.bins.sum()]
     truth = (both(other)[1] - both(plain)[1]).mean(0)[slow]
     tolerance = 0.02 if name == "rate" else 0.03  # trials differ in pace; the prediction is of their mean
     np.testing.assert_allclose(guess[: slow.size], truth, atol=tolerance)

@@ -141,7 +141,12 @@ def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, 
 def _named(columns: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:
     """Entries of features under the names that info.json has for them."""
     out: dict[str, np.ndarray] = {}
-    labels = {name: _labels(feature) for name, feature in info["features"].items()}
+    labels = {}
+    for name, feature in info["features"].items():
+        names = feature.get("names") if isinstance(feature, dict) else None
+        if isinstance(names, dict):  # {"motors": [...]}
+            names = next(iter(names.values()), None)
+        labels[name] = [str(each) for each in names] if isinstance(names, list) else []
     for column, values in columns.items():
         name, _, entry = column.partition("[")
         index = entry.rstrip("]")
@@ -150,10 +155,3 @@ def _named(columns: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np
             column = f"{name}.{known[int(index)]}"
         out[column] = values
     return out
-
-
-def _labels(feature: Any) -> list[str]:
-    names = feature.get("names") if isinstance(feature, dict) else None
-    if isinstance(names, dict):  # {"motors": [...]}
-        names = next(iter(names.values()), None)
-    return [str(name) for name in names] if isinstance(names, list) else []

@@ -28,13 +28,9 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         problem = "holds one array without a name" if lonely else "is no archive of NumPy's"
         raise InputError(str(path), problem, "one array a column, as numpy.savez writes them")
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        names = [
-            info.filename.removesuffix(".npy")
-            for info in archive.infolist()
-            if info.filename.endswith(".npy")
-        ]
+        names = _names(archive)
         chosen = [name for name in names if is_wanted(name, wanted)]
-        _check_size(path, sum(_claimed(path, archive, name) for name in chosen))
+        _check_size(path, archive, chosen)
         file.seek(0)
         arrays = np.load(file, allow_pickle=False)
         columns = {name: arrays[name] for name in chosen}
@@ -46,10 +42,10 @@ def num_rows(path: Path) -> int | None:
     if not zipfile.is_zipfile(path):
         return None
     with zipfile.ZipFile(path) as archive:
-        names = [i.filename for i in archive.infolist() if i.filename.endswith(".npy")]
+        names = _names(archive)
         if not names:
             return None
-        with archive.open(names[0]) as member:
+        with archive.open(f"{names[0]}.npy") as member:
             shape, fortran, dtype = _header(member)
         return shape[0] if len(shape) == 1 and dtype.kind in "fiu" and not fortran else None
 
@@ -57,8 +53,7 @@ def num_rows(path: Path) -> int | None:
 def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator[Table]:
     """Tables of at most `rows` rows each, in order: a long file in bounded memory, packed or not."""
     with zipfile.ZipFile(path) as archive, ExitStack() as open_:
-        every = [i.filename.removesuffix(".npy") for i in archive.infolist() if i.filename.endswith(".npy")]
-        members, kinds, lengths = {}, {}, {}
+        every, members, kinds, lengths = _names(archive), {}, {}, {}
         for name in every:
             if wanted is not None and name not in wanted:
                 continue
@@ -68,17 +63,22 @@ def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator
             if len(shape) != 1:
                 raise InputError(f"{path}: column {name}", f"has {len(shape)} axes", "one number a row")
             lengths[name] = shape[0]
-        if len(set(lengths.values())) > 1:
-            raise InputError(
-                str(path), f"has columns of {sorted(set(lengths.values()))} rows", "of one length"
-            )
-        for first in range(0, next(iter(lengths.values()), 0), rows):
-            count = min(rows, next(iter(lengths.values())) - first)
+        found = sorted(set(lengths.values())) or [0]
+        if len(found) > 1:
+            raise InputError(str(path), f"has columns of {found} rows", "of one length")
+        for first in range(0, found[0], rows):
+            count = min(rows, found[0] - first)
             columns = {
                 name: np.frombuffer(member.read(count * kinds[name].itemsize), kinds[name])
                 for name, member in members.items()
             }
             yield Table(str(path), tuple(every), columns, np.arange(first + 1, first + count + 1))
+
+
+def _names(archive: zipfile.ZipFile) -> list[str]:
+    """Names of an archive's arrays."""
+    files = [info.filename for info in archive.infolist()]
+    return [name.removesuffix(".npy") for name in files if name.endswith(".npy")]
 
 
 def _header(member: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -92,13 +92,13 @@ def unpack(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an archive by name, with the same checks."""
     with zipfile.ZipFile(path) as archive:
         names = [each.filename.removesuffix(".npy") for each in archive.infolist()]
-        _check_size(path, sum(_claimed(path, archive, name) for name in names))
+        _check_size(path, archive, names)
     with np.load(path, allow_pickle=False) as file:
         return {name: file[name] for name in names}
 
 
-def _check_size(path: Path, size: int) -> None:
-    packed = path.stat().st_size
+def _check_size(path: Path, archive: zipfile.ZipFile, names: Sequence[str]) -> None:
+    packed, size = path.stat().st_size, sum(_claimed(path, archive, name) for name in names)
     if size > MAX_ARCHIVE or (size > BOMB and size > PACKED * packed):
         raise InputError(str(path), f"unpacks from {packed} to {size} bytes", "a recording")
 
