@@ -10,9 +10,10 @@ sure anything is cannot be counted in rows. It is learned between motions, and b
   delete-one jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's
   degrees of freedom. This takes in whatever makes motions disagree: the model's error, repeats, noise, and
   how little they tell of theta. Motions do not disagree in what is wrong alike in all of them. So to it
-  comes what delta moves by when the prior's mean, one more observation, moves by its sd; and what it moves by
-  when all else that was fitted to OLD is by DRIFT otherwise in NEW: laws of friction hold about the load and
-  speed that they were fitted at, and no robot is on two days the same.
+  comes what delta moves by when the prior's mean, one more observation, moves by its sd; what it moves by
+  when all else that was fitted to OLD is by DRIFT otherwise in NEW, for laws of friction hold about the load
+  and speed that they were fitted at, and no robot is on two days the same; and RESPONSE of delta itself, by
+  which the model may answer a change too much or too little.
 * *Which*: an explanation's energy is minus its log evidence (Laplace's, delta's prior a Cauchy in its
   coordinates) by the fit to all motions together. A row counts as many times less as rows depend on each
   other, which OLD's motions show by how far each pulls theta. What one motion says of delta alone is little:
@@ -72,6 +73,7 @@ TRIED, PAIRED, SECOND = 5, 2, 4  # numerics: changes fitted exactly, of those jo
 CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
 MATTERS = 0.1  # chosen: of what is missed of new logs, what a change must take; less a day may make
 DRIFT = 0.1  # prior: of a parameter, or of its usual size: by how much what is fitted differs in NEW
+RESPONSE = 0.03  # prior: of a change: by how much a model answers it wrongly in all motions alike
 RIVAL = 0.05  # chosen: of right explanations, those that a wrong one may rule out
 UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called unknown
 
@@ -195,8 +197,9 @@ class Comparison:
         own = {of.names[m] for m in mine}
         drift = np.array([0.0 if n in own else DRIFT**2 for n in self.old.theta.names])
         by_drift = added_by_drift(total, bend[:p, :p], drift / self.old.dependence) * self.old.dependence
-        sd, freedom = jackknife(moved, (np.sum(by_prior**2, 1) + by_drift)[p:])
         x = z[p:]
+        known = (np.sum(by_prior**2, 1) + by_drift)[p:] + (RESPONSE * x) ** 2
+        sd, freedom = jackknife(moved, known)
         schur = total[p:, p:] - total[p:, :p] @ np.linalg.solve(total[:p, :p], total[:p, p:])
         occam = float(np.sum(np.log(np.pi * (1 + x**2)))) - 0.5 * k * np.log(2 * np.pi)
         occam += 0.5 * float(np.linalg.slogdet(schur / self.old.dependence + np.eye(k))[1]) if k else 0.0

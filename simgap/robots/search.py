@@ -41,6 +41,7 @@ from simgap.simulators.protocol import Parameter
 
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are judged by
 TRIED = 4  # numerics: sets that are fitted exactly about one point
+LEARNED = 2  # numerics: of these, what tells how far straight lines are off of what takes a cause's place
 LEADERS = 16  # numerics: candidates that are rolled out where they fit best
 USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
 LEAVES = (
@@ -374,7 +375,7 @@ class Search:
         sets, levels = self.place(at, self.wanted)
         names = [n for n in sets.names if n not in self.against]
         near = neighbours(at.names, sets.names)
-        if len(names) <= MANY:
+        if at is best and len(names) <= MANY:  # what takes a cause's place is one
             near += pairs(at.names, names)
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
@@ -386,7 +387,7 @@ class Search:
             known = score.max(0)[[{*names} == {*best.names} for names in near]]
             least = min(0.0, *(known - own + at.score - best.score)) - NEAR
         effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
-        tried, found = 0, best
+        tried, off, found = 0, 0.0, best
         for k in np.argsort(-promised):
             if tried >= TRIED or promised[k] < least:
                 break
@@ -396,6 +397,9 @@ class Search:
                 continue
             scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
             one, tried = self.settled(names, begin, scales, best.score), tried + 1
+            off = max(off, one.score - best.score - promised[k])
+            if at is not best and tried == LEARNED:  # what others promise is wrong by as much as of these
+                least = max(least, -NEAR - off)
             if one.score > found.score and self._is_better(one, best):
                 found = one
                 if at is best and one.score > best.score + NEAR:  # about it all others are proposed anew
