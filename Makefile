@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot sequences robots-models bench-long gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs
+.PHONY: oldest newest golden robots-check robots-given bench-robot sequences robots-models bench-long gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs gap-fresh
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
@@ -94,6 +94,14 @@ gap-results: $(INSTALLED)  ## diagnoses of the labelled RECORDINGS; fills docs/g
 
 gap-labs: $(INSTALLED)  ## diagnoses of open labs in the folder LABS; fills docs/gap_results.md
 	$(BIN)/python -m experiments.gap_drawn $(or $(LABS),../shared/recordings_labs) --results build/gap_labs --run "this code"
+	$(BIN)/python -m experiments.write_tables
+
+FRESH := experiments/results/gap_fresh.json
+gap-fresh: $(INSTALLED)  ## diagnoses of labs of our own second simulator, drawn anew; fills docs/gap_results.md
+	$(BIN)/python -m experiments.blind_check open --cases 36 --seed 271131 --out build/healthy
+	$(BIN)/python -m experiments.blind_check open --cases 24 --seed 271141 --tiers single pair outside --out build/acting
+	$(BIN)/python -m experiments.gap_drawn build/healthy --results build/healthy_found --run "seed 271131" --output $(FRESH)
+	$(BIN)/python -m experiments.gap_drawn build/acting --results build/acting_found --run "seed 271141" --output $(FRESH)
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md

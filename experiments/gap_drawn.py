@@ -1,11 +1,12 @@
 """The diagnosis in open labs: false alarms, single effects, pairs, effects from outside, default flags.
 
-    python -m experiments.gap_drawn FOLDER --results DIR --run NAME [--cases CASE ...]
+    python -m experiments.gap_drawn FOLDER --results DIR --run NAME [--cases CASE ...] [--output FILE.json]
 
 FOLDER holds cases with labels.json next to them: those of another simulator, or those that
 `python -m experiments.blind_check open` draws. Diagnoses go to DIR/CASE.json, so that a run may be
-stopped and started again, and the rows of this run stand under NAME in experiments/results/gap_labs.json,
-next to those of other code. Nothing is sealed: what is changed by what comes out is judged on other cases.
+stopped and started again, and the rows of this run stand under NAME in FILE.json
+(experiments/results/gap_labs.json), next to those of other code. Nothing is sealed: what is changed by what
+comes out is judged on other cases.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.blind_check.diagnose import diagnose_folder
+from experiments.blind_check.judge import intervals_hold
 from experiments.saving import save
 from experiments.table_text import load, markdown
 
@@ -62,13 +64,19 @@ def row(label: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         "p_value": found.get("detection", {}).get("p_value"), "gain": gains.get(label["effects"][0]),
         "held_out": (found.get("shrinkage") or {}).get("fraction"),
         "probability": found.get("probabilities", {}).get("+".join(sorted(label["effects"])), 0.0),
-        "seconds": round(found["seconds"], 1),
+        "seconds": round(found["seconds"], 1), "covered": covered(label, found),
     }  # fmt: skip
 
 
-def table() -> str | None:
-    """docs/gap_results.md: open labs of another simulator, one column a version of the code."""
-    found = load("gap_labs")
+def covered(label: dict[str, Any], found: dict[str, Any]) -> list[bool]:
+    """Whether 90 % intervals of named effects hold what is true, of labels in the contract's parameters."""
+    ours = {*label.get("params", {})} == {*label["effects"]} and found.get("verdict") in ("named", "set")
+    return list(intervals_hold({**label, "effects": label["params"]}, found).values()) if ours else []
+
+
+def table(name: str = "gap_labs") -> str | None:
+    """docs/gap_results.md: open labs, one column a version of the code, or a set of labs."""
+    found = load(name)
     if not isinstance(found, dict):
         return None
     runs: dict[str, list[dict[str, Any]]] = found["runs"]
@@ -77,12 +85,16 @@ def table() -> str | None:
         cells = []
         for rows in runs.values():
             of = [r for r in rows if r["tier"] in tiers]
-            cells.append(f"{sum(r['outcome'] in which for r in of)} of {len(of)}")
+            cells.append(f"{sum(r['outcome'] in which for r in of)} of {len(of)}" if of else "")
         return [name, *cells]
 
     def weak(rows: Sequence[dict[str, Any]]) -> str:
         named = [r for r in rows if r["verdict"] in ("named", "set")]
         return f"{sum(r['held_out'] is not None and r['held_out'] < WEAK for r in named)} of {len(named)}"
+
+    def held(rows: Sequence[dict[str, Any]]) -> str:
+        each = [one for r in rows for one in r.get("covered", [])]
+        return f"{sum(each)} of {len(each)}" if each else ""
 
     lines = [
         line("healthy: none", ["healthy"], "quiet"),
@@ -96,6 +108,7 @@ def table() -> str | None:
         line("pairs: one of both", ["pair"], "half"),
         line("outside: unknown", ["outside"], "unknown"),
         ["named with a held-out share below 0.3", *(weak(rows) for rows in runs.values())],
+        ["90 % intervals that hold the parameter", *(held(rows) for rows in runs.values())],
         ["seconds of processor, median",
          *(str(round(sorted(r["seconds"] for r in rows)[len(rows) // 2]) or "") for rows in runs.values())],
     ]  # fmt: skip
@@ -119,6 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--results", type=Path, required=True)
     parser.add_argument("--run", required=True)
     parser.add_argument("--cases", nargs="+")
+    parser.add_argument("--output", type=Path, default=RESULT)
     options = parser.parse_args(arguments)
     labels = json.loads((options.folder / "labels.json").read_text(encoding="utf-8"))
     options.results.mkdir(parents=True, exist_ok=True)
@@ -139,8 +153,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         one = row(label, json.loads(file.read_text(encoding="utf-8")))
         runs.setdefault(options.run, []).append(one)
         print(*(one[k] for k in ("case", "effects", "outcome", "causes", "held_out")), flush=True)
-    before = json.loads(RESULT.read_text(encoding="utf-8"))["runs"] if RESULT.exists() else {}
-    save(RESULT, {"runs": before | runs})
+    file = options.output
+    before = json.loads(file.read_text(encoding="utf-8"))["runs"] if file.exists() else {}
+    save(file, {"runs": before | runs})
 
 
 if __name__ == "__main__":

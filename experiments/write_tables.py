@@ -43,6 +43,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/results.md", "gap", gap_recordings.describe, "gap-results"),
     ("docs/gap_results.md", "recordings", gap_recordings.table, "gap-results"),
     ("docs/gap_results.md", "labs", gap_drawn.table, "gap-labs"),
+    ("docs/gap_results.md", "fresh", partial(gap_drawn.table, "gap_fresh"), "gap-fresh"),
     ("docs/gap_results.md", "blind", blind_check.blind, "blind-check"),
     ("docs/tables/blind.csv", "", blind_check.by_circumstance, "blind-check"),
     ("docs/benchmarks.md", "commands", commands.table, "bench"),

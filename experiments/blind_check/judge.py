@@ -128,7 +128,7 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
     if tier == "dense":
         row["dominant"] = bool(true) and max(entry["sizes"], key=lambda k: entry["sizes"][k]) in said
     if tier in ("single", "pair", "dense") and named:
-        row["covered"] = _covered(entry, found)
+        row["covered"] = intervals_hold(entry, found)
     return row
 
 
@@ -169,7 +169,7 @@ def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
     return [(float(a["probability"]), name in entry["effects"]) for name, a in acting.items()]
 
 
-def _covered(entry: dict, found: dict) -> dict[str, bool]:
+def intervals_hold(entry: dict, found: dict) -> dict[str, bool]:
     """Whether the 90 % interval of each true effect's parameter holds its value, where it was named."""
     got = {}
     for name in found["causes"]:

@@ -263,21 +263,20 @@ def loading(
     return HandEffect(correct=correct, apply=apply, **more)
 
 
-def mixing(matrix: Callable[[Values], Array], inverse: bool = False, **more: Any) -> HandEffect:
-    """Sensors that read matrix(values) (4, 4) times the true forces, or its `inverse`.
+def mixing(matrix: Callable[[Values], Array], **more: Any) -> HandEffect:
+    """Sensors that read matrix(values) (4, 4) times the true forces.
 
     The noise of net forces, grip and shear is by so much louder than that of corrected ones as the matrix
     turns it.
     """
 
     def correct(world: World, values: Values, on: Array) -> World:
-        back = matrix(values) if inverse else np.linalg.inv(matrix(values))
+        back = np.linalg.inv(matrix(values))
         quiet = np.sqrt(np.square(NET).sum(1) / np.square(NET @ back).sum(1))
         return world._replace(force=world.force @ back.T, loudness=world.loudness * quiet)
 
     def apply(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
-        there = matrix(values)
-        return with_force(p, flat(p) @ (np.linalg.inv(there) if inverse else there).T)
+        return with_force(p, flat(p) @ matrix(values).T)
 
     return HandEffect(correct=correct, apply=apply, **more)
 
