@@ -119,7 +119,7 @@ def table(name: str = "gap_labs") -> str | None:
         if r["outcome"] not in ("quiet", "named") and (r["tier"], r["outcome"]) != ("outside", "unknown")
     ]
     return (
-        markdown(["figure", *runs], lines)
+        markdown(["figure", *runs], [each for each in lines if any(each[1:])])
         + f"\n\nNot right by the last of these: {'; '.join(wrong) or 'none'}."
     )
 
