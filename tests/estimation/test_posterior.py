@@ -215,7 +215,7 @@ def test_the_mode_is_stationary_and_its_covariance_the_inverse_curvature():
 def test_jax_and_numpy_agree_on_the_density():
     post = posterior(drawn(make_design(deviations=2), 7)[0])
     theta = 3 * np.random.default_rng(0).normal(size=(200, 6))
-    found = log_density(jnp.asarray(theta), jax.tree.map(jnp.asarray, post.tables), jnp)
+    found = log_density(jnp.asarray(theta), jax.tree.map(jnp.asarray, post.model), jnp)
     np.testing.assert_allclose(found, post.log_prob(theta), rtol=1e-10)
     assert 0 < np.isinf(found).sum() < 20  # beyond the farthest as well
 
