@@ -29,7 +29,7 @@ and the length of all links together.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 
@@ -364,7 +364,9 @@ class ForceScale:
         )
 
 
-def force_scale(doubt: PadDoubt, weighed: Sequence[WeighedTrial], rig: Rig) -> ForceScale | None:
+def force_scale(
+    doubts: Mapping[str, PadDoubt], weighed: Sequence[WeighedTrial], rig: Rig
+) -> ForceScale | None:
     """The scale of forces where pads and noise say anything against 1; None where nothing does.
 
     Not to be used where forces come late, which makes slopes of readings over them flat.
@@ -372,7 +374,7 @@ def force_scale(doubt: PadDoubt, weighed: Sequence[WeighedTrial], rig: Rig) -> F
     tip = rig.fingertip
     if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
         return None
-    (normal, normal_sd), (shear, shear_sd) = doubt.seen
+    (normal, normal_sd), (shear, shear_sd) = (doubt.seen for doubt in doubts.values())
     if normal_sd > TELLING:
         return None
     share = np.expm1(-GRID)  # of compliance beyond the stated one, where forces are g times too large

@@ -20,11 +20,12 @@ from estimation.checks import (
     unstated_pads,
 )
 from estimation.consistency import contradictions, force_scale
-from estimation.design import Design, Unknown
+from estimation.design import Design, Unknown, build
 from estimation.friction import FrictionPosterior, friction_posteriors
 from estimation.observations import Noise, WeighedTrial, aligned_weights
+from estimation.posterior import posterior
 from estimation.report import Actual, inference_data, properties_table, summary
-from estimation.sampler import Draws, designs, sample_either
+from estimation.sampler import Draws, sample
 from hmmseg.contact.decompose import (
     ABOVE_GROUND,
     FREE,
@@ -174,7 +175,7 @@ def identify_aligned(
     trials = [one.trial for one in aligned.trials]
     weighed, noise = aligned_weights(aligned, rng)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
-    design, other = designs(aligned, weighed, noise)
+    design = build(aligned, weighed, noise)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
     hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
     if "friction" in hidden:
@@ -186,7 +187,8 @@ def identify_aligned(
     kept: list[int] = []
     contradicted: dict[str, str] = {}
     if design.unknowns:
-        found, sampled = sample_either(design, other, seed, progress)
+        found = posterior(design)
+        sampled = sample(found, seed, progress)
         if sampled.converged:
             predictive = check(found, sampled, rng)
             warnings += predictive.warnings
@@ -194,7 +196,7 @@ def identify_aligned(
             contradicted = contradictions(aligned, weighed, design)
             reasons |= contradicted | impossible(design, sampled)
             kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
-            scale = None if aligned.late else force_scale(design.doubt, weighed, rig)
+            scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
         if not sampled.converged:
             why = f"the sampler has not converged: {sampled.shortfall}"
             warnings.append(why)
