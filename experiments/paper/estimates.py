@@ -16,7 +16,7 @@ from estimation.paper_formulas import estimate_plugin
 from estimation.priors import property_priors
 from experiments.paper.sources import BLOCKS, ONE, PRINTED, qualitative, recorded, save, simulated
 from experiments.recordings import Case
-from hmmseg.contact.decompose import subtasks
+from hmmseg.contact.decompose import decompose
 
 KEYS = ("weight", "height", "width")
 PROPERTIES = (("block1", "weight"), ("block2", "height"), ("block1", "width"), ("block1", "friction"))
@@ -51,7 +51,7 @@ def table_3() -> list[dict]:
 
 def held(case: Case, name: str) -> list[str]:
     """Subtasks in which a block is held: all of them bear on its friction."""
-    return source_subtasks(subtasks(case.task), case.task, name, "width")
+    return source_subtasks(decompose(case.task), name, "width")
 
 
 def by_formula(case: Case) -> dict:
