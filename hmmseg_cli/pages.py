@@ -143,13 +143,12 @@ SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a page shows apart from the body: recordings, subtasks in order, the rig's pads, measured values,
+    """What a page shows apart from the body: recordings, the rig's pads, measured values,
     how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there,
     and where the motion to run next is.
     """
 
     files: Sequence[str]
-    subtasks: Sequence[str]
     rig: Mapping[str, Any] = field(default_factory=dict)
     measured: Mapping[str, Mapping[str, tuple[float, float]]] | None = None
     shows: Mapping[str, str] = field(default_factory=dict)
@@ -172,11 +171,9 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         to_do=to_do if body["verdict"] != "none" else [],
         remains=finding.remains(body),
         parameters=_parameters(effect, body["causes"], setting) if effect and body["causes"] else [],
-        subtasks=setting.subtasks,
-        heat=_heat(cells, setting.subtasks) if cells else [],
         where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
         more_cells=max(len(cells) - MOST, 0),
-        images=images | {n: None for n in ("gap_signal", "gap_before_after") if n not in images},
+        images=dict.fromkeys(("gap_where", "gap_signal", "gap_before_after")) | images,
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
         robot=finding.of_robot(body),
@@ -191,25 +188,6 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         warnings=setting.warnings,
         files=setting.files,
     )
-
-
-def _heat(cells: Mapping[tuple[str, str], Sequence], subtasks: Sequence[str]) -> list[dict[str, Any]]:
-    channels = [c for c in finding.CHANNELS if any(k[0] == c for k in cells)]
-    channels += sorted({k[0] for k in cells} - set(channels))
-    top = max(finding.share_of(found) for found in cells.values())
-    out = []
-    for channel in channels:
-        row = [cells.get((channel, subtask)) for subtask in subtasks]
-        shown = [_coloured(finding.share_of(found), top) if found else None for found in row]
-        out.append({"name": channel, "cells": shown})
-    return out
-
-
-def _coloured(share: float, top: float) -> dict[str, str]:
-    depth = (share / top) ** 0.5 if top > 0 else 0.0
-    light = 94 - 50 * depth
-    text = "<1" if share < 0.005 else f"{100 * share:.0f}"
-    return {"colour": f"hsl(24 90% {light:.0f}%)", "ink": "#fff" if light < 58 else "#3a1d00", "text": text}
 
 
 def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
