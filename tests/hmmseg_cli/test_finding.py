@@ -19,8 +19,6 @@ from simgap.report.finding import (
 from simgap.robot_effects import FAMILIES
 from simgap.simulators.mjcf.setting import KINDS
 
-SUBTASKS = ["pregrasp block1", "pickup block1", "carry block1", "place block1", "release block1"]
-
 
 def cell(channel: str, subtask: str, share: float, trial: str = "trial_01.csv", band=(0.0, 1.0)) -> dict:
     where = {"trial": trial, "channel": channel, "subtask": subtask, "band": list(band)}
