@@ -334,8 +334,8 @@ PADS_LOG_SD = 0.8  # prior: of a wrong stiffness: foams of another kind are a th
 NOISE_LOG_SD, AXIS_LOG_SD = 0.35, 0.3  # prior: noise is off its statement by a factor of two once in twenty
 RAISED = 4.0  # chosen: times its prior that the probability of a wrong scale must be, to be taken up
 UNSEEN = 10.0  # numerics: sd of a logarithm of which nothing is known
-# How pads' compliances (along the grip, in shear) and noise (x, y) look, all in logarithms, where nothing is
-# wrong, pads are softer, or forces of both axes or the vertical ones are read too large.
+# physics: how pads' compliances (along the grip, in shear) and noise (x, y) look, all in logarithms, where
+# nothing is wrong, pads are softer, or forces of both axes or the vertical ones are read too large
 EXPLANATIONS = np.array([
     [0, 0, 0, 0], [1, 1, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [-1, -1, 1, 1], [0, -1, 0, 1]
 ])  # fmt: skip
