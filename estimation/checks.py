@@ -28,8 +28,8 @@ from hmmseg.io.units import UNITS
 from hmmseg.levels import CERTAIN, MOVED
 from hmmseg.segmentation.align import AlignedTrials
 
-NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.0035
-SMALL = 0.005  # chosen: p-value from which a check warns; a result has up to a dozen of them
+NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.003
+SMALL = (1 - CERTAIN) / len(CHANNELS)  # p-value from which a check warns, so that a result surely has none
 MEANING = {
     "force": "the net vertical force while carried differs between grips",
     "distance": "the distance of the fingers while held differs between grips",

@@ -332,7 +332,6 @@ MISREAD = 0.25  # prior: share of forces among what is to blame where pads and f
 GAIN_LOG_SD = 1.0  # prior: of log g: another range or unit of the amplifier
 PADS_LOG_SD = 0.8  # prior: of a wrong stiffness: foams of another kind are a third or three times as stiff
 NOISE_LOG_SD, AXIS_LOG_SD = 0.35, 0.3  # prior: noise is off its statement by a factor of two once in twenty
-RAISED = 4.0  # chosen: times its prior that the probability of a wrong scale must be, to be taken up
 UNSEEN = 10.0  # numerics: sd of a logarithm of which nothing is known
 # physics: how pads' compliances (along the grip, in shear) and noise (x, y) look, all in logarithms, where
 # nothing is wrong, pads are softer, or forces of both axes or the vertical ones are read too large
@@ -402,7 +401,7 @@ def force_scale(
     every = covariance + (SDS[:, None, None] ** 2) * EXPLANATIONS[:, :, None] * EXPLANATIONS[:, None, :]
     fit = (seen * np.linalg.solve(every, seen)).sum(axis=1)
     odds = softmax(np.log(ODDS) - (fit + np.linalg.slogdet(every)[1]) / 2)[4:]
-    if odds.sum() < RAISED * MISSTATED * MISREAD:
+    if odds.sum() < MISSTATED:  # no likelier than that anything at all is wrong, before grips are seen
         return None
     louder = EXPLANATIONS[4:] @ np.linalg.inv(covariance)
     precision = GAIN_LOG_SD**-2 + (louder * EXPLANATIONS[4:]).sum(axis=1)

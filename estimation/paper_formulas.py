@@ -29,7 +29,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import StateLabels, label_states
 
-TRIM = 0.05  # chosen: share of the carry left out at either end of the weight estimate
+TRIM = 0.05  # cited: share of the carry left out at either end of the weight estimate, by the paper
 
 
 Properties = dict[str, dict[str, dict[str, Any] | None]]  # by object and property, as in identify's JSON
