@@ -14,13 +14,12 @@ import jinja2
 import hmmseg
 from estimation.identification import Identification
 from estimation.plots import draw_check, draw_corner, draw_estimates
-from estimation.report import Actual
+from estimation.report import INTERVALS, Actual, property_rows
 from hmmseg.io.trial import Trial
 from hmmseg.numbers import (
     SHOWN,
     between,
     estimate,
-    fixed,
     interval,
     percent,
     plain,
@@ -91,10 +90,13 @@ def identification_page(
          estimate(check["scatter_between_grips"], 0, shown_as("N" if name == "force" else "m")))
         for name, check in (body.get("predictive") or {}).items()
     ]  # fmt: skip
+    apart = ("measured", "deviation") if measured is not None else ()
+    keys = ("block", "property", "estimate", *INTERVALS, *apart, "from")
     return rendered(
         "identify.html.j2", method=body["method"], objects=list(body["properties"]),
         verdict=[_verdict(obj, entry) for obj, entry in body["properties"].items()],
-        warnings=warnings, measured=measured is not None, rows=_rows(body, measured), figures=figures,
+        warnings=warnings, measured=measured is not None, figures=figures,
+        rows=[[row[key] for key in keys] for row in property_rows(body, measured)],
         trials=shown, sampler=body["sampler"], predictive=checks, notes=body.get("notes", ()),
     )  # fmt: skip
 
@@ -110,29 +112,6 @@ def _verdict(obj: str, entry: dict[str, Any]) -> str:
     elif friction:
         parts.append(f"has a friction coefficient of at least {plain(friction['lower_bound'])}")
     return f"{obj} {', '.join(parts)}." if parts else f"Nothing could be determined of {obj}."
-
-
-def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]]:
-    """Block, property, estimate, intervals, what was measured and the deviation from it, source."""
-    rows = []
-    for name, entry in ((f"{o}.{p}", e) for o, own in body["properties"].items() for p, e in own.items()):
-        obj, _, prop = name.rpartition(".")
-        value, shown = (measured or {}).get(obj, {}).get(prop), SHOWN[prop]
-        source, text, inner, outer, deviation = body["reasons"].get(name, ""), "unknown", "", "", ""
-        if entry is not None:
-            source = ", ".join(entry.get("subtasks", ()))
-            text = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
-        if entry is not None and entry.get("mean") is not None:
-            text = estimate(entry["mean"], entry["sd"], shown)
-            inner = interval(*entry["interval_68"], shown=shown, sds=2.0)
-            outer = interval(*entry["interval_95"], shown=shown, sds=3.9)
-            if value is not None:
-                compared = body.get("actual", {}).get(obj, {}).get(prop, {})
-                deviation = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"
-                deviation += ", disagrees" if compared.get("disagrees") else ""
-        apart = ("" if value is None else estimate(*value, shown), deviation) if measured else ()
-        rows.append((obj, prop, text, inner, outer, *apart, source))
-    return rows
 
 
 Body = Mapping[str, Any]
