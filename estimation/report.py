@@ -165,9 +165,10 @@ def property_rows(body: dict[str, Any], measured: Actual | None = None) -> list[
                 row["deviation"] += ", disagrees" if row["deviation"] else "disagrees"
         if entry is not None and entry.get("mean") is not None:
             row["estimate"] = estimate(entry["mean"], entry["sd"], shown)
-            row |= {
-                k: interval(*entry[k], shown, sds) for k, sds in (("interval_68", 2.0), ("interval_95", 3.9))
-            }
+            row["interval_68"], row["interval_95"] = (
+                interval(entry[name][0], entry[name][1], shown, sds)
+                for name, sds in zip(INTERVALS, (2.0, 3.9), strict=True)
+            )
         rows.append(row)
     return rows
 
