@@ -20,7 +20,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind
-from hmmseg.segmentation.changes import Change, Disagreement, disagreements
+from hmmseg.segmentation.changes import Change, discrepancies
 from hmmseg.segmentation.conformity import (
     MAX_RATE,
     Conformity,
@@ -68,7 +68,7 @@ class Reading:
 class Pool:
     """All recordings as they were read last, the fit of those that fit, and what they show of the hand.
 
-    `changes` are those of each fitted recording; `disagreement` as in `disagreements`. `remarks` tell
+    `changes` are those of each fitted recording; `discrepancy` as in `discrepancies`. `remarks` tell
     people what contradicts the rig.
     """
 
@@ -76,7 +76,7 @@ class Pool:
     fit: Fit
     sensing: Sensing
     changes: list[list[Change | None]] = field(default_factory=list)
-    disagreement: dict[tuple[Kind, int], Disagreement] = field(default_factory=dict)
+    discrepancy: dict[tuple[Kind, int], float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     late: bool = False
 
@@ -111,8 +111,8 @@ def pooled(
         contact_changes(readings[i].fine, readings[i].thinned, sensing, steps, fitted.parameters, alignment)
         for i, alignment in zip(fitting, fitted.posteriors, strict=True)
     ]
-    disagreement = disagreements([c for own in changes for c in own if c is not None])
-    return Pool(readings, fitted, sensing, changes, disagreement, remarks, late)
+    discrepancy = discrepancies([c for own in changes for c in own if c is not None])
+    return Pool(readings, fitted, sensing, changes, discrepancy, remarks, late)
 
 
 def _read(signals: Signals, rig: Rig, taps: Spans) -> Reading:
@@ -173,7 +173,7 @@ def aligned_rounds(
             continue
         alignment, changes = pool.fit.posteriors[position[i]], pool.changes[position[i]]
         found = boundary_posteriors(
-            changes, pool.disagreement, reading.thinned.t, alignment, reading.fine.touches
+            changes, pool.discrepancy, reading.thinned.t, alignment, reading.fine.touches
         )
         spans = to_spans(steps, found, *reading.ends)
         pieces.append(Piece(found, spans, None, float(alignment.log_evidence), *reading.ends))
@@ -222,7 +222,7 @@ def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity,
             reading.fine, reading.thinned, pool.sensing, shown.steps, own.parameters, alignment
         )
         found = boundary_posteriors(
-            changes, pool.disagreement, reading.thinned.t, alignment, reading.fine.touches
+            changes, pool.discrepancy, reading.thinned.t, alignment, reading.fine.touches
         )
     ends = reading.ends
     boundaries = task_boundaries(shown, found, len(steps), *ends)
