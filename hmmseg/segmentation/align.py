@@ -35,12 +35,12 @@ from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import (
-    InMemory,
     OnDisk,
     Recorded,
     cut,
     merge_point,
     one_round,
+    part,
     round_tasks,
     slices,
 )
@@ -91,7 +91,7 @@ def pooled(
     """
 
     def once(late: Sensing | None = None) -> tuple[list[Reading], Fit, Sensing]:
-        signals = (recorded.part(samples) for recorded, samples in parts)
+        signals = (part(recorded, samples) for recorded, samples in parts)
         signals = signals if late is None else (read_again(s, late) for s in signals)
         readings = [_read(s, rig, t) for s, t in zip(signals, taps, strict=True)]
         fitted = fit([readings[i].features for i in fitting], steps)
@@ -163,7 +163,7 @@ def aligned_rounds(
         pool = pooled(flat, fitting, steps, rig, taps)
     else:  # what is known of the sensors, and no alignment
         parameters = of[0].free.parameters
-        readings = [_read(r.part(p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
+        readings = [_read(part(r, p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
         pool = Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
     position = {i: j for j, i in enumerate(fitting)}
     pieces = []
@@ -193,7 +193,7 @@ def _rounds(
     cuts = [cut(f, task) for f in coarse]
     while True:
         every = [slices(r.t, at) for r, at in zip(recordings, cuts, strict=True)]
-        parts = [[features(thin(r.part(p), MAX_RATE), rig) for p in own]
+        parts = [[features(thin(part(r, p), MAX_RATE), rig) for p in own]
                  for r, own in zip(recordings, every, strict=True)]  # fmt: skip
         tasks = [own for p in parts for own in round_tasks(task, len(p))]
         found = iter(examine([f for own in parts for f in own], tasks))
@@ -357,7 +357,7 @@ def align(
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
     whole = [with_heights(s, trial, rig) for s, trial in zip(signals, trials, strict=True)]
     coarse = [features(thin(s, MAX_RATE), rig) for s in whole]
-    pool, pieces = aligned_rounds([InMemory(s) for s in signals], coarse, task, rig, all_fit)
+    pool, pieces = aligned_rounds(signals, coarse, task, rig, all_fit)
     done = performed(task, pieces)
     steps = subtasks(done)
     number = 1 if all_fit or done.repeat == "unknown" else done.repeat

@@ -13,7 +13,7 @@ from hmmseg.hand.signals import Signals, central_differences, one_sided
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known
-from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, combine, normal
+from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, evenly, normal
 from hmmseg.segmentation.changes import DISCREPANCY, Change, Penetration, Prior, cut, moment
 from hmmseg.segmentation.emissions import WINDOW, Parameters, noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
@@ -214,7 +214,7 @@ def boundary_posteriors(
     found = []
     for k, change in enumerate(changes):
         if change is None:
-            found.append(combine(t, posterior.moves[0][:, k], {}))
+            found.append(evenly(t, posterior.moves[0][:, k]))
         else:
             posted = moment(change, discrepancy.get(change.sort, DISCREPANCY))
             found.append(nearest_touch(touches, posted) if len(change.contacts) > 1 else posted)
