@@ -253,8 +253,6 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
         problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
         raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
                          "under [gripper], as they are mounted")  # fmt: skip
-    if gripper.tool_mass is not None:
-        found[1] = gripper.tool_mass
     return Tool(
         axes, found[:4], bool(found[1] != 0.0), axes @ found[4:7], axes @ found[7:], noise, since,
         float(error[7:].max()), bool(gripper.reaction is not None and found[0] < -SURE * error[0]),
@@ -285,6 +283,7 @@ def _fit(rig: Rig, motion: FreeMotion, time: np.ndarray
         residual = left - rows @ found
         noise = max(robust_sd(residual), 1e-6)
         weights = (TAIL + 3) / (TAIL + ((residual / noise) ** 2).sum(axis=1))
+    found[1] = given or found[1] * turns
     return axes, found, np.linalg.norm(np.linalg.pinv(flat, rcond=1e-9), axis=1), noise
 
 
