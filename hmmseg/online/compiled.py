@@ -58,7 +58,7 @@ class _Kept(IndexDataCacheFile):
 def compiled(function: Callable) -> Any:
     """`function` compiled at its first call, without the interpreter's lock."""
     function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
-    made = numba.njit(function, cache=CACHED, **OPTIONS)
+    made: Any = numba.njit(function, cache=CACHED, **OPTIONS)
     if CACHED:
         made._cache._cache_file.__class__ = _Kept
     return made
