@@ -201,7 +201,7 @@ def calibrate(
     if begin is None:
         linear = linearise(windows, point, [])
         whiten = covariances(windows, linear).whitener()
-        near, steps = moved_to(windows, linear, whiten, point, stated, STEPS).point, STEPS
+        near, steps = moved_to(windows, linear, whiten, point, stated, STEPS), STEPS
     tell("whole logs")
     whole = Composed.of(simulator, _stretches(recordings), mine, noise, LONGEST)
     start = min((near, point), key=lambda p: _cost(whole, p))
@@ -273,10 +273,10 @@ def _spread(composed: Composed) -> np.ndarray:
     return np.sqrt(np.maximum((np.bincount(channel, away**2) / count)[channel], composed.rows.variance))
 
 
-def _whitener(composed: Composed, linear: Linear) -> Whiten:
-    """Rows in units of what is left of their channel, what their log's uncertain start makes of them taken
-    off: (1 + U U')^(-1/2) by the singular values of U."""
-    scale, parts = _scales(composed, linear.residual), []
+def without_starts(composed: Composed, linear: Linear, scale: np.ndarray) -> Whiten:
+    """Rows in units of a scale (N,), what their log's uncertain start makes of them taken off:
+    (1 + U U')^(-1/2) by the singular values of U."""
+    parts = []
     for window, rows in zip(composed.windows, linear.rows.of, strict=True):
         doubt = [linear.starts[n][rows] * d for n, d in window.doubt.items()]
         if doubt:
@@ -293,6 +293,11 @@ def _whitener(composed: Composed, linear: Linear) -> Whiten:
     return whiten
 
 
+def _whitener(composed: Composed, linear: Linear) -> Whiten:
+    """Rows in units of what is left of their channel, less their starts."""
+    return without_starts(composed, linear, _scales(composed, linear.residual))
+
+
 def _least_squares(
     composed: Composed, point: Point, steps: int, free: Sequence[str]
 ) -> tuple[Point, Linear, Whiten]:
@@ -300,7 +305,7 @@ def _least_squares(
     whitened."""
     linear = linearise(composed, point, [])
     for _ in range(ROUNDS if steps == STEPS else 1):
-        point = moved_to(composed, linear, _whitener(composed, linear), point, free, steps).point
+        point = moved_to(composed, linear, _whitener(composed, linear), point, free, steps)
         linear = linearise(composed, point, [], linear.starts)
     return point, linear, _whitener(composed, linear)
 

@@ -7,7 +7,7 @@ logs that took no part, verdict, next experiment; `describe` makes the document.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from hmmseg.errors import InputError, nearest
 from simgap.progress import Progress, silent
@@ -16,7 +16,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
 from simgap.robots.heldout import Shrinkage, folds_of, shrinkage
 from simgap.robots.linear import Linear
-from simgap.robots.model import Composed, Point, is_numeric, motions
+from simgap.robots.model import Composed, Point, is_numeric
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.rows import noises
 from simgap.robots.search import Search, Settled
@@ -98,7 +98,6 @@ def diagnose(
     given = {} if length is None else {"length": length}
     calibrated = _Calibrated(simulator, recordings, effects, length)
     whole = Composed.of(simulator, recordings, effects, noise, **given)
-    whole = replace(whole, motion=motions(whole))
     parts = phases_of(simulator, recordings) if phases is None else phases
     # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
     # is not to be outvoted by it, and what it tells is asked where those tell nothing.

@@ -98,4 +98,4 @@ def _fitted(part: Composed, one: Settled, point: Point, only: Sequence[str] | No
     if not point:
         return point
     linear = linearise(part, point, [])
-    return moved_to(part, linear, covariances(part, linear).whitener(one.discrepancy), point, only).point
+    return moved_to(part, linear, covariances(part, linear).whitener(one.discrepancy), point, only)

@@ -235,7 +235,7 @@ class Search:
 
     def _moved(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
         linear = linearise(composed, begin, [], self.starts)
-        return moved_to(composed, linear, whiten, begin).point
+        return moved_to(composed, linear, whiten, begin)
 
     def _judged(self, composed: Composed, names: Names, point: Point) -> Settled:
         linear = linearise(composed, point, [*self.along, *names], self.starts)

@@ -37,8 +37,7 @@ def damped() -> Composed:
 @pytest.mark.parametrize("start", [0.0, 0.001, 0.1])
 def test_a_planted_value_is_found_from_wrong_starts(damped, start):
     found = fit(damped, {"viscous": {"viscous": start}})
-    assert found.point["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
-    assert found.gained > 100
+    assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
 
 
 def test_a_fit_comes_back_from_where_the_simulator_diverges():
@@ -49,7 +48,7 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
 
     model = composed(Brittle(), [log(0, viscous=VISCOUS)])
     found = fit(model, {"viscous": {"viscous": 0.2}})
-    assert found.point["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
+    assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
 
 
 def test_what_is_settled_stays(damped):
