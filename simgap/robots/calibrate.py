@@ -21,10 +21,9 @@ from simgap.progress import Progress, silent
 from simgap.robot_effects import LACKING
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.fit import FINEST, Whiten, moved_to
-from simgap.robots.heldout import folds_of
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point, is_numeric
-from simgap.robots.rows import noises
+from simgap.robots.rows import folds_of, noises
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator
@@ -336,7 +335,8 @@ def _held_out(
     """Root mean squares by channel of free runs along logs that a fit did not see, before and after."""
     rows, nominal = composed.rows, {n: composed.effects[n].neutral() for n in found}
     before = rows.observed - base_at(composed, nominal).rows
-    after, fold = np.full(rows.log.size, np.nan), folds_of_logs(composed)
+    every = range(len(composed.recordings))
+    after, fold = np.full(rows.log.size, np.nan), folds_of(rows, len(every), every)
     for number in np.unique(fold):
         mine = fold == number
         seen = composed.along(np.unique(rows.log[~mine]).tolist())
@@ -344,11 +344,6 @@ def _held_out(
         part = composed.along(np.unique(rows.log[mine]).tolist())
         after[mine] = rows.observed[mine] - base_at(part, point).rows
     return _rms(composed, before), _rms(composed, after)
-
-
-def folds_of_logs(composed: Composed) -> np.ndarray:
-    """The fold (N,) of each row: whole logs."""
-    return folds_of(composed.rows, len(composed.recordings), range(len(composed.recordings)))
 
 
 def _rms(composed: Composed, left: np.ndarray) -> dict[str, float]:

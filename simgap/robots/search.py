@@ -20,6 +20,7 @@ from scipy.stats import t as student
 
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
+from simgap.robots.calibrate import Calibration
 from simgap.robots.fit import moved_to, prior_cost
 from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, wobbling
 from simgap.robots.model import Composed, Point
@@ -95,12 +96,14 @@ class Settled:
 @dataclass
 class Search:
     """Sets of candidates along windows; `fold` (N,) of each row. `known`: sets that were fitted, each at its
-    best; `calibrated`: where calibration ended."""
+    best; `calibrated` fits what nobody measured, from the model as it comes, for where a search from there
+    leaves a gap; `calibration`: what it found."""
 
     composed: Composed
     wanted: Names
     fold: np.ndarray
-    calibrated: Callable[[], Point] = dict
+    calibrated: Callable[[], Calibration | None] = lambda: None
+    calibration: Calibration | None = None
     known: dict[frozenset[str], Settled] = field(default_factory=dict)
     starts: dict = field(default_factory=dict)
     against: dict[str, float] = field(default_factory=dict)
@@ -165,7 +168,8 @@ class Search:
     def _calibrated(self) -> Settled | None:
         """Of what calibration moved as much as is needed: taken back one by one where the whole acts, in
         closed form."""
-        calibrated = self.calibrated()
+        self.calibration = self.calibrated()
+        calibrated = {} if self.calibration is None else self.calibration.point
         moved = {n: v for n, v in calibrated.items() if n in self.wanted and self._off(n, v)}
         if not moved:
             return None
