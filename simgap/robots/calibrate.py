@@ -19,7 +19,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects import LACKING
-from simgap.robot_effects.base import RobotEffect
+from simgap.robot_effects.base import NORMAL_90, RobotEffect, entry
 from simgap.robots.fit import FINEST, Whiten, moved_to
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point, is_numeric
@@ -37,7 +37,6 @@ LEAVES = 4.0  # numerics: squares over the noise's, from which laws that a model
 UNTOLD = 0.5  # chosen: of a prior's sd; a parameter of which logs leave more is not told by them
 NOTHING = 0.05  # numerics: a correlation that is none
 COUPLED = 0.05  # numerics: of a direction that is not told, what a parameter must have in it to be of it
-NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
 
 
 @dataclass(frozen=True)
@@ -74,35 +73,28 @@ class Calibration:
         own = [k for k in every if not self.composed.numeric(self.names[k][0])]
         untold = [k for k in own if not self.told[k]]
         return {
-            "parameters": {self.label(k): self._entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
+            "parameters": {self.label(k): self.entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
             "reasons": {self.label(k): self._reason(k) for k in untold},
             "combinations": self.combinations(),
-            "numerics": {self.label(k): self._entry(k) for k in every if k not in own},
+            "numerics": {self.label(k): self.entry(k) for k in every if k not in own},
             "heldout": {"before": dict(self.before), "after": dict(self.after)},
         }
 
     def label(self, k: int) -> str:
-        """A parameter's name: its effect's, and its own where that has several."""
+        """A parameter's name."""
         effect, short = self.names[k]
-        return effect if len(self.composed.effects[effect].parameters) == 1 else f"{effect}.{short}"
+        return self.composed.effects[effect].label(short)
 
     def value(self, k: int) -> float:
         """A parameter where the fit ended."""
         effect, short = self.names[k]
         return float(self.point[effect][short])
 
-    def _entry(self, k: int) -> dict[str, Any]:
+    def entry(self, k: int) -> dict[str, Any]:
+        """A parameter in the document."""
         effect, short = self.names[k]
         known = self.composed.effects[effect].parameters[short]
-        mean, sd = self.value(k), float(np.sqrt(self.covariance[k, k]))
-        low, high = max(mean - NORMAL_90 * sd, known.low), min(mean + NORMAL_90 * sd, known.high)
-        return {
-            "nominal": known.nominal,
-            "mean": mean,
-            "sd": sd,
-            "interval_90": [low, high],
-            "unit": known.unit,
-        }
+        return entry(known, self.value(k), float(np.sqrt(self.covariance[k, k])))
 
     def _reason(self, k: int) -> str:
         others = [self.label(i) for i in self._group(k) if i != k]

@@ -61,6 +61,7 @@ from simgap.robots.unchanged import (
     units_of,
     without_broken,
 )
+from simgap.robots.verdict import repeated
 from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
@@ -380,7 +381,7 @@ class Changes:
         for name in effects:
             shorts = self.composed.effects[name].parameters
             for short in shorts:
-                size = known[name if len(shorts) == 1 else f"{name}.{short}"]
+                size = known[self.composed.effects[name].label(short)]
                 out[short if len(effects) == 1 else f"{name}.{short}"] = size | {"nominal": size["old"]}
         return out
 
@@ -393,10 +394,7 @@ class Changes:
         apart = min((np.abs(c.left - self.best.left) * count for c in self.others), key=np.sum)
         unit = self.runs.units[int(apart.argmax())]
         log = self.composed.recordings[int(self.runs.log[self.runs.unit == unit][0])].name
-        return {
-            "do": f"repeat the motion of {log}", "log": log, "separates": list(separates),
-            "expected_gain_nats": float(apart.max()),
-        } if apart.max() > 1 else None  # fmt: skip
+        return repeated(log, separates, float(apart.max()))
 
     @property
     def over(self) -> float:
@@ -446,10 +444,8 @@ class Changes:
         low, now, high = (at.values(change.x + r) for r in (-reach, 0 * reach, reach))
         out = {}
         for k, (effect, short) in enumerate(at.names):
-            known = self.composed.effects[effect]
-            name = effect if len(known.parameters) == 1 else f"{effect}.{short}"
-            ratio = at.log[k]
-            out[name] = {
+            known, ratio = self.composed.effects[effect], at.log[k]
+            out[known.label(short)] = {
                 "old": float(at.at[k]), "mean": float(now[k]),
                 "sd": float(min(change.sd[k], 1e6) * at.slopes(change.x)[k]),
                 "interval_90": [float(low[k]), float(high[k])], "unit": known.parameters[short].unit,

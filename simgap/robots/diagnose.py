@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from hmmseg.errors import InputError, nearest
 from simgap.progress import Progress, silent
@@ -21,7 +22,7 @@ from simgap.robots.phases import Phases, phases_of
 from simgap.robots.rows import folds_of, noises
 from simgap.robots.search import Search, Settled
 from simgap.robots.sets import Identifiability
-from simgap.robots.verdict import NextLog, RobotVerdict, next_log, verdict_on
+from simgap.robots.verdict import RobotVerdict, next_log, verdict_on
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -41,7 +42,7 @@ class RobotDiagnosis:
     verdict: RobotVerdict
     shrinkage: Shrinkage | None
     identifiable: Identifiability
-    next_log: NextLog | None
+    next_log: dict[str, Any] | None
     calibrated: Calibration | None
     warnings: tuple[str, ...]
 

@@ -230,10 +230,6 @@ class Composed:
     def _acting(self, point: Point) -> list[tuple[RobotEffect, dict[str, float]]]:
         return [(self.effects[n], {**self.effects[n].neutral(), **v}) for n, v in point.items()]
 
-    def run(self, point: Point) -> list[Channels | None]:
-        """True channels of every window."""
-        return self.rolled(point, self.starts(point))
-
 
 def is_numeric(simulator: Simulator, effect: RobotEffect) -> bool:
     """Whether an effect is of the simulator's own numerics: its step, how it holds commands."""

@@ -45,9 +45,7 @@ TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, what tells how far straight lines are off of what takes a cause's place
 LEADERS = 16  # numerics: candidates that are rolled out where they fit best
 USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
-LEAVES = (
-    2.0  # numerics: squares over the noise's; a set that leaves more may be better begun from the calibration
-)
+LEAVES = 2.0  # numerics: squares over the noise's, from which a search begins from the calibration, too
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
 JOINED = " against "
 NEAR = 10.0  # numerics: nats by which straight lines may be wrong of what takes a cause's place
@@ -250,14 +248,8 @@ class Search:
         if wide := cov.off_alone(whiten, left):
             off = cov.learned(left, wide)
             whiten = cov.whitener(off, wide)
-        sets = Sets.of(
-            composed.effects,
-            linear,
-            [whiten],
-            [n for n in names if n in linear.moved],
-            self.fold,
-            self.log_odds,
-        )
+        usable = [n for n in names if n in linear.moved]
+        sets = Sets.of(composed.effects, linear, [whiten], usable, self.fold, self.log_odds)
         score = promise = -np.inf
         if not linear.diverged:
             white = whiten(left)
@@ -291,8 +283,7 @@ class Search:
                 more |= {} if one is None else {name: one}
         linear = linear.with_moved(more)
         cov = covariances(composed, linear)
-        scales = [Discrepancy({n: s * k for n, s in at.discrepancy.scale.items()}) for k in LEVELS]
-        scales = scales if at.discrepancy else []
+        scales = [{n: s * k for n, s in at.discrepancy.items()} for k in LEVELS if at.discrepancy]
         levels = [cov.whitener(d, at.wide) for d in (*scales, NONE)]
         usable = [n for n in names if n in linear.moved]
         sets = Sets.of(composed.effects, linear, levels, usable, self.fold, self.log_odds)
