@@ -1,5 +1,7 @@
 # On a fresh machine with Python >= 3.11, pip and make, every target sets itself up first.
 PYTHON ?= python3
+# As the command has it: matrices are many and small.
+export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
