@@ -401,7 +401,7 @@ def force_scale(
     every = covariance + (SDS[:, None, None] ** 2) * EXPLANATIONS[:, :, None] * EXPLANATIONS[:, None, :]
     fit = (seen * np.linalg.solve(every, seen)).sum(axis=1)
     odds = softmax(np.log(ODDS) - (fit + np.linalg.slogdet(every)[1]) / 2)[4:]
-    if odds.sum() < MISSTATED:  # no likelier than that anything at all is wrong, before grips are seen
+    if odds.sum() <= MISSTATED * MISREAD:  # no likelier than before grips are seen
         return None
     louder = EXPLANATIONS[4:] @ np.linalg.inv(covariance)
     precision = GAIN_LOG_SD**-2 + (louder * EXPLANATIONS[4:]).sum(axis=1)

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import product
 from math import gcd, lcm
-from operator import itemgetter
 
 import numpy as np
 
@@ -351,8 +350,7 @@ def pad_doubts(
 ) -> dict[str, PadDoubt]:
     """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, "normal" and "shear".
 
-    `variance`, `alike`: as in `slope_variances`, of all trials. A share that several kinds of slope find is
-    that of the surest of them.
+    `variance`, `alike`: as in `slope_variances`, of all trials.
     """
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
     for s, grip in ((a.signals, grip) for a in weighed for grip in a.weights.grips.values()):
@@ -364,26 +362,13 @@ def pad_doubts(
         (("normal", DISTANCE, -1.0), ("shear", RISE, 1.0)), np.median(usual, axis=0).tolist(), strict=True
     ):
         stated = bool(np.isfinite(getattr(rig.fingertip, f"{kind}_stiffness")))
-        mine = [k for k, (c, _) in enumerate(SLOPES.values()) if c == channel]
-
-        def seen(kinds: Sequence[int]) -> list[np.ndarray]:
-            known = np.isfinite(slopes[..., kinds])
-            return [values[..., kinds][known] for values in (slopes, variance, alike)]
-
-        found, surest = (0.0, 0.0), (0.0, np.inf)
-        for k in mine:
-            share, spread, together = seen([k])
-            apart = shared_error(together, spread)
-            if share.size:
-                middle, error = middle_share(share, spread, 0.0)
-                surest = min(surest, (sign * middle, float(np.hypot(error, apart))), key=itemgetter(1))
-            said = misstated(share, spread, stated, admitted if stated else 0.0, apart)
-            found = max(found, said, key=itemgetter(1))
-        share, spread, together = seen(mine)
-        out[kind] = PadDoubt(
-            sign * found[0], found[1], shared_error(together, spread),
-            0.0 if stated else possible_share(share, spread), force, surest,
-        )  # fmt: skip
+        known = np.isfinite(slopes) & (np.array([c for c, _ in SLOPES.values()]) == channel)
+        share, spread = sign * slopes[known], variance[known]
+        apart = shared_error(alike[known], spread)
+        middle, error = middle_share(share, spread, 0.0) if share.size else (0.0, np.inf)
+        found, odds = misstated(share, spread, stated, admitted if stated else 0.0, apart)
+        give = 0.0 if stated else possible_share(share, spread)
+        out[kind] = PadDoubt(found, odds, apart, give, force, (middle, float(np.hypot(error, apart))))
     return out
 
 

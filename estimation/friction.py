@@ -8,15 +8,15 @@ Where a block is slid, the net force gives the friction against its support (`gr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
-from estimation.observations import MIN_FREE, WeighedTrial, gravity_factor
+from estimation.observations import MIN_FREE, WeighedTrial
 from estimation.report import summary
-from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
+from hmmseg.contact.decompose import FREE, ON_GROUND, SLIDING, Subtask, subtasks
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.levels import CERTAIN, FIRM, SURE
@@ -25,7 +25,6 @@ from hmmseg.segmentation.emissions import acceleration
 
 FEWEST = 4  # numerics: samples of sliding
 WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little
-COEFFICIENTS = np.geomspace(0.01, 3.0, 400)  # prior: evenly in their logarithm; solids slide on solids within
 
 
 @dataclass(frozen=True)
@@ -38,27 +37,36 @@ class GroundFriction:
 
 def ground_friction(
     weighed: Sequence[WeighedTrial], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
-    sd_force: float, rng: np.random.Generator, num_draws: int,
+    weight: np.ndarray | None, rng: np.random.Generator,
 ) -> GroundFriction | None:  # fmt: skip
     """Friction of a block on what it is slid on; None where it is not, or where that says too little.
 
-    The last support counts where a task slides the block on several.
+    The law d fx = mu (W - fy) + W d a / g is linear in mu where `weight`, draws (num_draws,) of W [N], is
+    known, and in mu W, mu and W where it is not. The last support counts where a task slides the block on
+    several.
     """
     slid = [s for s in steps if s.object == obj and s.state == SLIDING and s.move is not None]
     if not slid:
         return None
     support = task.performed[slid[-1].move or 0].to
     rows = [_rows(a, s, rig) for a in weighed for s in slid if task.performed[s.move or 0].to == support]
-    table = np.concatenate(rows)
-    if len(table) < FEWEST:
+    push, lag, down = np.concatenate(rows).T
+    if push.size < FEWEST:
         return None
-    stated = weighed[0].signals.sd_force
-    noise = 2 * (stated if np.isfinite(stated) else sd_force) ** 2
-    log_posterior = _log_posterior(table, noise, _carried(weighed, steps, obj, rig, noise))
-    probability = np.exp(log_posterior - log_posterior.max())
-    cdf = np.cumsum(probability * np.gradient(COEFFICIENTS))
-    draws = np.interp(rng.uniform(size=num_draws) * cdf[-1], cdf, COEFFICIENTS)
-    return GroundFriction(support, draws) if draws.std() < WIDEST * draws.mean() else None
+    if weight is None:
+        columns = np.stack([-down, np.ones(push.size), lag], axis=1)
+        found, *_ = np.linalg.lstsq(columns, push, rcond=None)
+        mean, square = found[:1], float(np.linalg.pinv(columns.T @ columns)[0, 0])
+        left = push - columns @ found
+    else:
+        weight = rng.choice(weight, (DRAWS, 1))
+        right, pushed = weight - down, push - weight * lag
+        square = 1 / (right**2).sum(axis=1)
+        mean = (right * pushed).sum(axis=1) * square
+        left = (pushed - mean[:, None] * right).mean(axis=0)
+    sd = np.sqrt(square * (left @ left) / max(push.size - 3, 1))
+    draws = mean + sd * rng.standard_normal(DRAWS)
+    return GroundFriction(support, draws) if 0 < draws.std() < WIDEST * draws.mean() else None
 
 
 def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
@@ -73,50 +81,6 @@ def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
     bias_x, bias_y = (float(free @ np.nan_to_num(f)) for f in (s.fx, s.fy))
     lag = direction * np.nan_to_num(acceleration(s.t, s.vx)) / rig.gravity
     return np.stack([direction * (s.fx - bias_x), lag, s.fy - bias_y], axis=1)[sliding]
-
-
-def _carried(
-    weighed: Sequence[WeighedTrial], steps: tuple[Subtask, ...], obj: str, rig: Rig, noise: float
-) -> tuple[float, float] | None:
-    """Weight and its sd [N] from carries of the same block; None where it is not carried."""
-    moves = [s.move for s in steps if s.object == obj and s.state == ABOVE_GROUND and s.move is not None]
-    means, counts = [], []
-    for a in weighed:
-        factor, s = gravity_factor(a.signals, rig), a.signals
-        bias = float(a.weights.free @ np.nan_to_num(s.fy))
-        for move in moves:
-            weight, count = a.weights.grips[move]["force"].mean(axis=0), a.weights.counts[move]["force"]
-            if count.min() > 0:
-                means.append(float(weight @ np.nan_to_num(s.fy - bias) / (weight @ factor)))
-                counts.append(float(count.mean()))
-    if not means:
-        return None
-    total = float(np.sum(counts))
-    return float(np.dot(means, counts) / total), float(np.sqrt(noise / total)) + 0.005 * abs(means[0])
-
-
-def _log_posterior(table: np.ndarray, noise: float, carried: tuple[float, float] | None) -> np.ndarray:
-    """Log density (num_coefficients,) of the law with noise in both net forces, weight marginalised.
-
-    For a given mu the law is linear in W: d fx + mu fy = W (mu + d a / g). The prior of W is
-    Gaussian as `carried` has it, otherwise flat in its logarithm.
-    """
-    left = table[:, 0] + COEFFICIENTS[:, None] * table[:, 2]
-    right = COEFFICIENTS[:, None] + table[:, 1]
-    variance = noise * (1 + COEFFICIENTS**2)
-    mean, precision = (0.0, 0.0) if carried is None else (carried[0], carried[1] ** -2)
-
-    def fitted(inflated: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        information = (right**2).sum(axis=1) / inflated + precision
-        weight = ((left * right).sum(axis=1) / inflated + mean * precision) / information
-        square = ((left - weight[:, None] * right) ** 2).sum(axis=1) / inflated
-        return square + precision * (weight - mean) ** 2, weight, information
-
-    excess = max(float(fitted(variance)[0].min()) / max(len(table) - 2, 1), 1.0)
-    square, weight, information = fitted(variance * excess)
-    out = -0.5 * (square + len(table) * np.log(variance) + np.log(information))
-    flat = np.log(np.maximum(weight, 1e-6)) if carried is None else 0.0
-    return np.where(weight > 0, out - flat, -np.inf)
 
 
 PRIOR = 0.05  # prior: probability of slip before the anchors are seen
@@ -158,17 +122,6 @@ class SlipEvidence:
     seen: bool
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """Stretches of one length after padding, arrays (num_stretches, longest)."""
-
-    t: np.ndarray
-    anchor: np.ndarray
-    variance: np.ndarray
-    shift: np.ndarray
-    there: np.ndarray
-
-
 def slip_evidence(
     stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
 ) -> SlipEvidence:
@@ -180,18 +133,21 @@ def slip_evidence(
     every = _rescaled([*stretches, *(s for s in others if s.t.size > 2)])
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)
-    count, batch = len(stretches), _padded(every)
-    stray = _log_likelihood(batch, STRAY_DRIFT) + np.log(STRAY)
-    still = np.stack([_log_likelihood(batch, drift) for drift in DRIFTS]) + np.log(1 - STRAY)
+    own = every[: len(stretches)]
+    stray = np.array([_log_density(s, STRAY_DRIFT) for s in every]) + np.log(STRAY)
+    still = np.array([[_log_density(s, drift) for s in every] for drift in DRIFTS]) + np.log(1 - STRAY)
     still = np.logaddexp(still, stray)
-    log_drift = np.log(np.asarray(DRIFT_PRIOR))[:, None]
-    moved = []
-    for coefficient in np.quantile(bound_draws, (0.1, 0.5, 0.9)):
-        own = still.copy()
-        own[:, :count] = _may_slip(batch, still, every[:count], float(coefficient))
-        moved.append(own)
-    joint = log_drift.T + np.sum(moved, axis=2)
-    factor = float(logsumexp(joint) - np.log(len(moved)) - logsumexp(log_drift[:, 0] + still.sum(axis=1)))
+    log_drift = np.log(np.asarray(DRIFT_PRIOR))
+    moved = np.repeat(still[None], 3, axis=0)
+    for k, coefficient in enumerate(np.quantile(bound_draws, (0.1, 0.5, 0.9))):
+        for i, s in enumerate(own):
+            near = _near(s, float(coefficient))
+            if near.any():
+                slips = [logsumexp([_log_density(s, drift, v, near) for v in SPEEDS]) for drift in DRIFTS]
+                slips = np.array(slips) + np.log((1 - STUCK) / len(SPEEDS))
+                moved[k, :, i] = np.logaddexp(slips, still[:, i] + np.log(STUCK))
+    joint = log_drift + moved.sum(axis=2)
+    factor = float(logsumexp(joint) - np.log(len(moved)) - logsumexp(log_drift + still.sum(axis=1)))
     odds = factor + np.log(PRIOR / (1 - PRIOR))
     probability = float(1 / (1 + np.exp(-np.clip(odds, -700, 700))))
     return SlipEvidence(probability, factor, probability > CERTAIN)
@@ -206,57 +162,24 @@ def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
     return [replace(s, sd=s.sd * max(shown, 1.0)) for s in stretches]
 
 
-def _padded(stretches: list[Stretch]) -> _Batch:
-    shape = (len(stretches), max(s.t.size for s in stretches))
-    out = _Batch(np.zeros(shape), np.zeros(shape), np.ones(shape), np.zeros(shape), np.zeros(shape, bool))
-    for i, s in enumerate(stretches):
-        n = s.t.size
-        out.t[i, :n], out.variance[i, :n], out.there[i, :n] = s.t - s.t[0], s.sd**2, True
-        out.anchor[i, :n] = s.anchor - np.median(s.anchor)
-        out.shift[i, :n] = s.compliance * (s.shear - s.shear.mean())
-    return out
+def _near(s: Stretch, coefficient: float) -> np.ndarray:
+    """Whether the pad may slip from each sample to the next (num_samples - 1,): the shear's sign, or 0."""
+    near = np.sign(s.ratio) * (np.abs(s.ratio) >= coefficient - NEAR * s.ratio_sd)
+    return np.where(near[1:] != 0, near[1:], near[:-1])
 
 
-def _may_slip(batch: _Batch, still: np.ndarray, stretches: list[Stretch], coefficient: float) -> np.ndarray:
-    """Log density (num_drifts, num_stretches) where each pad slips at some speed or is stuck."""
-    # Times [s] during which each pad may have slipped until each sample, and the same signed by shear.
-    time, signed = np.zeros((2, len(stretches), batch.t.shape[1]))
-    for i, s in enumerate(stretches):
-        near = np.sign(s.ratio) * (np.abs(s.ratio) >= coefficient - NEAR * s.ratio_sd)
-        sign = np.where(near[1:] != 0, near[1:], near[:-1])
-        time[i, 1 : s.t.size] = np.cumsum(np.diff(s.t) * np.abs(sign))
-        signed[i, 1 : s.t.size] = np.cumsum(np.diff(s.t) * sign)
-    out = still[:, : len(time)].copy()
-    near = np.flatnonzero(time.any(axis=1))
-    if near.size == 0:
-        return out
-    chosen = _Batch(*(values[near] for values in vars(batch).values()))
-    for i, drift in enumerate(DRIFTS):
-        moving = [_log_likelihood(chosen, drift, v, time[near], signed[near]) for v in SPEEDS]
-        slips = logsumexp(moving, axis=0) + np.log((1 - STUCK) / len(SPEEDS))
-        out[i, near] = np.logaddexp(slips, out[i, near] + np.log(STUCK))
-    return out
-
-
-def _log_likelihood(
-    batch: _Batch, drift: float, speed: float = 0.0,
-    time: np.ndarray | None = None, signed: np.ndarray | None = None,
-) -> np.ndarray:  # fmt: skip
-    """Log density (num_stretches,) of the anchors under one drift and one speed of slip."""
-    there = batch.there[:, :, None] & batch.there[:, None, :]
-    covariance = ANYWHERE**2 + batch.shift[:, :, None] * batch.shift[:, None, :]
-    covariance += drift**2 * np.minimum(batch.t[:, :, None], batch.t[:, None, :])
-    residual = batch.anchor
-    if time is not None and signed is not None:
-        covariance += speed**2 * PERSISTENCE * np.minimum(time[:, :, None], time[:, None, :])
+def _log_density(s: Stretch, drift: float, speed: float = 0.0, near: np.ndarray | None = None) -> float:
+    """Log density of the anchors under one drift and, while `near`, one speed of slip."""
+    t, shift = s.t - s.t[0], s.compliance * (s.shear - s.shear.mean())
+    covariance = ANYWHERE**2 + np.outer(shift, shift) + drift**2 * np.minimum.outer(t, t)
+    residual = s.anchor - np.median(s.anchor)
+    if near is not None:
+        time, signed = (np.append(0.0, np.cumsum(np.diff(t) * each)) for each in (np.abs(near), near))
+        covariance += speed**2 * PERSISTENCE * np.minimum.outer(time, time)
         residual = residual - speed * signed
-    covariance = np.where(there, covariance, 0.0) + batch.variance[:, :, None] * np.eye(there.shape[1])
-    # Padding has unit variance and no residual, so it adds nothing to either term.
-    factor = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(factor, residual[:, :, None])[:, :, 0]
-    diagonal = np.diagonal(factor, axis1=1, axis2=2)
-    size = batch.there.sum(axis=1)
-    return -0.5 * (white**2).sum(axis=1) - np.log(diagonal).sum(axis=1) - 0.5 * size * np.log(2 * np.pi)
+    factor = np.linalg.cholesky(covariance + np.diag(s.sd**2))
+    white = np.linalg.solve(factor, residual)
+    return float(-0.5 * white @ white - np.log(np.diag(factor)).sum() - 0.5 * t.size * np.log(2 * np.pi))
 
 
 CONCENTRATION = 1.0  # prior: weight of G, in samples
@@ -375,11 +298,12 @@ class _Forces:
 
 def friction_posteriors(
     weighed: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
-    rng: np.random.Generator,
+    rng: np.random.Generator, weights: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
     """Friction of every object of the task, all trials pooled, alignments marginalised.
 
-    `sd_force`: noise of one force sample [N] where the signals do not state it.
+    `sd_force`: noise of one force sample [N] where the signals do not state it; `weights`: posterior draws
+    of objects' weights [N].
     """
     steps = subtasks(task)
     fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in weighed]
@@ -387,7 +311,7 @@ def friction_posteriors(
     resting = {obj: _stretches(weighed, fingers, steps, obj, rig) for obj in task.objects}
     out = {}
     for obj in task.objects:
-        ground = ground_friction(weighed, task, steps, obj, rig, sd_force, rng, DRAWS)
+        ground = ground_friction(weighed, task, steps, obj, rig, (weights or {}).get(obj), rng)
         if held[obj][0].size == 0:
             reason = f"the recording never shows {obj} held firmly"
             out[obj] = FrictionPosterior(None, reason=reason, ground=ground)

@@ -168,31 +168,33 @@ def identify_aligned(
     weighed, noise = aligned_weights(aligned, rng)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(aligned, weighed, noise)
-    friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
+    warnings, notes = misfits(aligned), []
+    predictive, scale = None, None
+    found = posterior(design) if design.unknowns else None
+    sampled = None if found is None else sample(found, seed, progress)
+    weights = {}
+    if sampled is not None and sampled.converged:
+        weights = {u.name[0]: sampled.flat[:, i] for i, u in enumerate(design.unknowns) if u.prop == "weight"}
+    friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng, weights)
     hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
     if "friction" in hidden:
         friction = {obj: FrictionPosterior(None, reason=hidden["friction"], ground=f.ground)
                     for obj, f in friction.items()}  # fmt: skip
-    warnings, notes = misfits(aligned), []
-    sampled, predictive, scale = None, None, None
     reasons = _reasons(aligned, design, friction)
     kept: list[int] = []
     contradicted: dict[str, str] = {}
-    if design.unknowns:
-        found = posterior(design)
-        sampled = sample(found, seed, progress)
-        if sampled.converged:
-            predictive = check(found, sampled, rng)
-            warnings += predictive.warnings
-            notes += [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
-            contradicted = contradictions(aligned, weighed, design)
-            reasons |= contradicted | impossible(design, sampled)
-            kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
-            scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
-        if not sampled.converged:
-            why = f"the sampler has not converged: {sampled.shortfall}"
-            warnings.append(why)
-            reasons |= {".".join(u.name): why for u in design.unknowns if u.single}
+    if found is not None and sampled is not None and sampled.converged:
+        predictive = check(found, sampled, rng)
+        warnings += predictive.warnings
+        notes += [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
+        contradicted = contradictions(aligned, weighed, design)
+        reasons |= contradicted | impossible(design, sampled)
+        kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
+        scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
+    elif sampled is not None:
+        why = f"the sampler has not converged: {sampled.shortfall}"
+        warnings.append(why)
+        reasons |= {".".join(u.name): why for u in design.unknowns if u.single}
     unknowns, centres = tuple(design.unknowns[i] for i in kept), dict[tuple[str, str], float]()
     if sampled is not None:
         if sampled.converged:

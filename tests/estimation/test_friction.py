@@ -214,7 +214,8 @@ def test_sliding_tells_the_friction_of_the_support(task, close):
             fx1=held + push + noise[0], fx2=-held + noise[1], fy1=down / 2 + noise[2],
             fy2=down / 2 + noise[3], vx1=sliding * 0.1, vx2=sliding * 0.1,
         )  # fmt: skip
-        ground = friction_posteriors([trial], task, RIG, SD, rng)["cup"].ground
+        known = {"cup": rng.normal(weight, 0.01, 500)} if carried.any() else {}
+        ground = friction_posteriors([trial], task, RIG, SD, rng, known)["cup"].ground
         assert ground is not None and ground.support == "ground"
         assert ground.mu_draws.mean() == pytest.approx(mu, abs=close)
         z.append((ground.mu_draws.mean() - mu) / ground.mu_draws.std())
