@@ -19,6 +19,7 @@ from hmmseg.hand.signals import Signals, task_space, timely, with_heights
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
+from hmmseg.levels import decisive
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind
 from hmmseg.segmentation.changes import Change, discrepancies
 from hmmseg.segmentation.conformity import (
@@ -32,7 +33,7 @@ from hmmseg.segmentation.conformity import (
 )
 from hmmseg.segmentation.emissions import WINDOW, Features, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
-from hmmseg.segmentation.pads import Sensing, read_again, sense
+from hmmseg.segmentation.pads import LEAD_SD, Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import (
     OnDisk,
@@ -102,11 +103,17 @@ def pooled(
         return readings, fitted, sense(fine, paths, steps, fitted.parameters, rig, again)
 
     readings, fitted, sensing = once()
-    remarks, late = sensing.remarks(rig), sensing.late
     if sensing.late:
-        readings, fitted, again = once(sensing)
-        remarks = replace(again, late=True, filter=sensing.filter, delay=sensing.delay).remarks(rig)
-        sensing = replace(again, delay_sd=float(np.hypot(again.delay_sd, sensing.delay_sd)))
+        *second, again = once(sensing)
+        if not again.heights_gain(sensing) > decisive(0.5):  # a sensor's delay is common to all forces
+            sensing = replace(sensing, delay=0.0, delay_sd=LEAD_SD, late=False, filter=False)
+        else:
+            readings, fitted = second
+            doubt = float(np.hypot(again.delay_sd, sensing.delay_sd))
+            sensing = replace(sensing, normal=again.normal, shear=again.shear, friction=again.friction)
+    remarks, late = sensing.remarks(rig), sensing.late
+    if late:  # of what was read again nothing is late any more
+        sensing = replace(sensing, delay=0.0, delay_sd=doubt)
     changes = [
         contact_changes(readings[i].fine, readings[i].thinned, sensing, steps, fitted.parameters, alignment)
         for i, alignment in zip(fitting, fitted.posteriors, strict=True)
