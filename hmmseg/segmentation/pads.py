@@ -196,7 +196,6 @@ SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
 BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
 REACH = 0.4  # numerics: s; free motion before and after a hold that is used: the longest delay, and a touch
-LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be used
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 LARGEST = 0.9  # chosen: quantile of what all contacts show, of friction or of ringing, that is the largest
 
@@ -387,8 +386,6 @@ def _compliance(
     c, w, apart = found[found[:, 1] > 0].T
     if not c.size:
         return Compliance(prior[0], prior[1], FORM)
-    telling = w > LEAST * w.max()
-    c, w, apart = c[telling], w[telling], apart[telling]
     middle = weighted_median(c, w)
     # Scatter of stretches beyond what noise explains, by a robust method of moments.
     spread = NORMAL * weighted_median(np.abs(c - middle), w)
