@@ -28,7 +28,6 @@ from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.levels import TAIL
 from hmmseg.robust import median_of_known, robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
-from hmmseg.segmentation.conformity import MAX_RATE
 from hmmseg.segmentation.emissions import acceleration, thin
 from hmmseg.tables import Brief
 
@@ -237,7 +236,7 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
     steps, rig = aligned.subtasks, aligned.rig
     prepared, felt, touches = [], [], []  # felt: what the fingers press with is measured
     for trial in aligned.trials:
-        thinned = thin(trial.signals, MAX_RATE)
+        thinned = thin(trial.signals)
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
         drawn = draw_boundaries(trial, rng, NUM_ALIGNMENTS)
         best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]

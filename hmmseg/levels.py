@@ -11,6 +11,7 @@ CERTAIN = 0.99  # chosen: probability from which something is taken for true, an
 FIRM = 0.5  # chosen: share of a grip's usual force from which the fingers hold
 MOVED = 3e-3  # chosen: m by which a hand or a block has gone somewhere; blocks are taller, slips shorter
 GAP = 3.0  # chosen: usual sample periods that make a gap
+SETTLING = 0.2  # prior: s in which a contact settles after a change, and rings
 DRIFTS = 0.15  # chosen: s in which a hand at rest stays where it is; it drifts over more
 TAIL = 4.0  # cited: degrees of freedom of Student-t residuals: Lange, Little and Taylor, JASA 84, 1989
 

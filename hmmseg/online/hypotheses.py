@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hmmseg.contact.equations import Pads
-from hmmseg.levels import MOVED
+from hmmseg.levels import MOVED, SETTLING
 from hmmseg.online.compiled import compiled
 from hmmseg.online.hypothesis import (
     ABOVE_KIND,
@@ -27,7 +27,7 @@ from hmmseg.online.hypothesis import (
     log_sum,
     supported,
 )
-from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, RINGING, SETTLING, STAGES
+from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, RINGING, STAGES
 
 LOG_DEPARTURE = math.log(DEPARTURE)
 PACE = 1.0  # prior: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary

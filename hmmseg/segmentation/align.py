@@ -19,10 +19,10 @@ from hmmseg.hand.signals import Signals, task_space, timely, with_heights
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
+from hmmseg.levels import decisive
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind
 from hmmseg.segmentation.changes import Change, discrepancies
 from hmmseg.segmentation.conformity import (
-    MAX_RATE,
     Conformity,
     at,
     examine,
@@ -32,7 +32,7 @@ from hmmseg.segmentation.conformity import (
 )
 from hmmseg.segmentation.emissions import WINDOW, Features, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
-from hmmseg.segmentation.pads import Sensing, read_again, sense
+from hmmseg.segmentation.pads import LEAD_SD, Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import (
     OnDisk,
@@ -102,11 +102,17 @@ def pooled(
         return readings, fitted, sense(fine, paths, steps, fitted.parameters, rig, again)
 
     readings, fitted, sensing = once()
-    remarks, late = sensing.remarks(rig), sensing.late
     if sensing.late:
-        readings, fitted, again = once(sensing)
-        remarks = replace(again, late=True, filter=sensing.filter, delay=sensing.delay).remarks(rig)
-        sensing = replace(again, delay_sd=float(np.hypot(again.delay_sd, sensing.delay_sd)))
+        *second, again = once(sensing)
+        if not again.heights_gain(sensing) > decisive(0.5):  # a sensor's delay is common to all forces
+            sensing = replace(sensing, delay=0.0, delay_sd=LEAD_SD, late=False, filter=False)
+        else:
+            readings, fitted = second
+            doubt = float(np.hypot(again.delay_sd, sensing.delay_sd))
+            sensing = replace(sensing, normal=again.normal, shear=again.shear, friction=again.friction)
+    remarks, late = sensing.remarks(rig), sensing.late
+    if late:  # of what was read again nothing is late any more
+        sensing = replace(sensing, delay=0.0, delay_sd=doubt)
     changes = [
         contact_changes(readings[i].fine, readings[i].thinned, sensing, steps, fitted.parameters, alignment)
         for i, alignment in zip(fitting, fitted.posteriors, strict=True)
@@ -147,7 +153,7 @@ def aligned_rounds(
 ) -> tuple[Pool, list[list[Piece]]]:
     """What all recordings show together, and the rounds of each, aligned.
 
-    `coarse` are features of each recording at conformity's MAX_RATE. `all_fit`: all are taken to fit.
+    `coarse` are features of each recording, thinned. `all_fit`: all are taken to fit.
     """
     if task.repeat == 1 or all_fit:
         every = [[slice(0, r.t.size)] for r in recordings]
@@ -193,7 +199,7 @@ def _rounds(
     cuts = [cut(f, task) for f in coarse]
     while True:
         every = [slices(r.t, at) for r, at in zip(recordings, cuts, strict=True)]
-        parts = [[features(thin(part(r, p), MAX_RATE), rig) for p in own]
+        parts = [[features(thin(part(r, p)), rig) for p in own]
                  for r, own in zip(recordings, every, strict=True)]  # fmt: skip
         tasks = [own for p in parts for own in round_tasks(task, len(p))]
         found = iter(examine([f for own in parts for f in own], tasks))
@@ -356,7 +362,7 @@ def align(
     if signals is None:
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
     whole = [with_heights(s, trial, rig) for s, trial in zip(signals, trials, strict=True)]
-    coarse = [features(thin(s, MAX_RATE), rig) for s in whole]
+    coarse = [features(thin(s), rig) for s in whole]
     pool, pieces = aligned_rounds(signals, coarse, task, rig, all_fit)
     done = performed(task, pieces)
     steps = subtasks(done)
@@ -386,7 +392,7 @@ def segment_long(recording: LongRecording, task: BlockTask, rig: Rig) -> Segment
     the times and what is read of each round at 100 Hz at most.
     """
     source = OnDisk(recording, rig)
-    coarse = [features(source.thinned(MAX_RATE), rig)]
+    coarse = [features(source.thinned(), rig)]
     pool, pieces = aligned_rounds([source], coarse, task, rig)
     done = performed(task, pieces)
     number = 1 if done.repeat == "unknown" else done.repeat

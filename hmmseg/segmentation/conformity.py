@@ -31,7 +31,7 @@ from hmmseg.contact.decompose import (
 )
 from hmmseg.hmm import Chain, dense, viterbi
 from hmmseg.io.task import BlockTask
-from hmmseg.levels import MOVED
+from hmmseg.levels import MOVED, SETTLING
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from hmmseg.segmentation.emissions import Features, Parameters
 from hmmseg.segmentation.free_contacts import (
@@ -44,7 +44,7 @@ from hmmseg.segmentation.free_contacts import (
 )
 
 DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
-SETTLING, STAGES = 0.2, 3  # prior: s, and most stages (of an Erlang law) in which a contact state settles
+STAGES = 3  # prior: most of an Erlang law, in which a contact state settles
 BRIEF = 1e-8  # prior: to end before is less likely by this: a bounce is no grip, a halt in the air no place
 
 
@@ -149,7 +149,6 @@ def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) 
 ENDING = 1e-3  # prior: and that its recording stops before the task's end
 # cited: s; no new grip begins before a slip is felt (Johansson and Westling, Exp. Brain Res. 66, 1987)
 LAPSE = 0.074
-MAX_RATE = 50.0  # chosen: Hz; noise of finer samples is averaged before they are judged
 MAX_ASSIGNMENTS = 24  # numerics: tried at most
 MANY = 20  # learned: trials; of more than these one alone does not sway what most have learned
 BETWEEN_TRIALS = 2.0  # prior: slack of like blocks: poses, pads and cables shift widths and weights as well
@@ -197,7 +196,7 @@ class Conformity:
 def examine(features: Sequence[Features], tasks: Sequence[BlockTask]) -> list[Conformity]:
     """Conformity of every trial; `tasks` have the same moves, each from where its trial starts.
 
-    `features` need no more than MAX_RATE: contact states last longer than its samples.
+    `features` need no more than emissions' MAX_RATE: contact states last longer than its samples.
 
     Each trial is judged by its own parameters; what most others have learned of the blocks then
     tells whether it moved the same ones.

@@ -26,7 +26,6 @@ from hmmseg.segmentation.fit import maximisation, otsu
 
 SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
 SAME_WEIGHT = 0.25  # chosen: ... and, relatively, in weight are grips of one block
-PRESSED = 30  # chosen: noise sds of a grip force that is there all the time, and so no bias
 ENDS = 3  # numerics: samples of whose heights the median is a grip's height at either end
 
 
@@ -65,7 +64,7 @@ def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
     apart = high.size > 0 and np.median(high) - np.median(low) > SURE * noise
     # Where one group alone is there, opposed forces far above the noise are a grip, others a bias.
     opposed = abs(median_of_known(f.force[:, 0] + f.force[:, 2], np.inf)) < 0.3 * np.median(grip[there])
-    if np.median(low) > (0.3 * np.median(high) if apart else PRESSED * noise) and opposed:
+    if np.median(low) > (0.3 * np.median(high) if apart else SURE * noise) and opposed:
         return np.zeros(4), noise, every
     threshold = np.median(low) + 0.25 * (np.median(high) - np.median(low)) if apart else np.inf
     held = filled(grip) > threshold

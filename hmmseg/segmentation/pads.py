@@ -23,7 +23,7 @@ delay by how sharp they are. Widths follow from each hold, the compliance is pro
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import SURE, TAIL, decisive
-from hmmseg.robust import NORMAL, median_of_known, weighted_median
+from hmmseg.robust import NORMAL, median_of_known, robust_sd, weighted_median
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
@@ -196,7 +196,6 @@ SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
 BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
 REACH = 0.4  # numerics: s; free motion before and after a hold that is used: the longest delay, and a touch
-LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be used
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 LARGEST = 0.9  # chosen: quantile of what all contacts show, of friction or of ringing, that is the largest
 
@@ -225,7 +224,8 @@ class Sensing:
 
     `delay` [s] is of the forces (negative: they lead), `delay_sd` its standard deviation. Where it is the
     sensor's (`late`), forces are to be read `delay` later, or, of a `filter`, undone. `friction` is the
-    largest ratio of shear to grip force observed on one finger's pad as it lets go.
+    largest ratio of shear to grip force observed on one finger's pad as it lets go. `rests` [m]:
+    how far heights of blocks at rest are off what the pads make of their loads.
     """
 
     normal: Compliance
@@ -235,11 +235,18 @@ class Sensing:
     late: bool = False
     filter: bool = False
     friction: float = np.inf
+    rests: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def pads(self) -> Pads:
         """Both fingers alike."""
         return Pads(self.normal.value, self.normal.value, self.shear.value, self.shear.value)
+
+    def heights_gain(self, other: Sensing) -> float:
+        """By how much [nats] heights of blocks at rest fit their loads better than in another reading."""
+        if not (self.rests.size and other.rests.size):
+            return np.inf
+        return DEPENDENT * self.rests.size * float(np.log(robust_sd(other.rests) / robust_sd(self.rests)))
 
     def remarks(self, rig: Rig) -> tuple[str, ...]:
         """What the recording contradicts the rig in, for people."""
@@ -330,10 +337,11 @@ def sense(
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
     timing, toe = lateness(felt, priors[0]), NONE
     lead = 0.0 if timing.late else timing.delay
-    if not (timing.late or again):  # forces that were late, or a wrist's, show no law so finely
+    if not again:  # forces that were late, or a wrist's, show no law so finely
         toe = find([(*reading(s, lead), s.sd) for s in grips])
         if toe is not NONE:  # what bends looks like what is late
-            grips, timing, lead = [replace(s, toe=toe) for s in grips], Lateness(), 0.0
+            grips, lead = [replace(s, toe=toe) for s in grips], 0.0
+            timing = timing if timing.late else Lateness()
     normal, shear = (
         _compliance([(*reading(s, lead), s.sd) for s in own], prior, float(r))
         for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)
@@ -342,7 +350,11 @@ def sense(
     between = BETWEEN * float(np.median([np.median(np.diff(s.t)) for s in signals])) if timing.late else 0.0
     doubt = float(np.sqrt(timing.sd**2 + (LATE_SHARE * timing.delay * timing.late) ** 2 + between**2))
     friction = float(np.quantile(ratios, LARGEST)) if ratios else np.inf
-    return Sensing(normal, shear, timing.delay, doubt, timing.late, timing.filter, friction)
+    heights = [
+        place + shear.value * load for load, place in (reading(s, lead) for s in loads) if load.size > 3
+    ]
+    rests = np.concatenate([np.zeros(0), *(height - np.median(height) for height in heights)])
+    return Sensing(normal, shear, timing.delay, doubt, timing.late, timing.filter, friction, rests)
 
 
 def _prior(compliance: float, stated: float) -> tuple[float, float]:
@@ -374,8 +386,6 @@ def _compliance(
     c, w, apart = found[found[:, 1] > 0].T
     if not c.size:
         return Compliance(prior[0], prior[1], FORM)
-    telling = w > LEAST * w.max()
-    c, w, apart = c[telling], w[telling], apart[telling]
     middle = weighted_median(c, w)
     # Scatter of stretches beyond what noise explains, by a robust method of moments.
     spread = NORMAL * weighted_median(np.abs(c - middle), w)

@@ -21,7 +21,7 @@ from hmmseg.hmm import dense
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.conformity import DEPARTURE, Conformity, assignments, column, departing, settled
-from hmmseg.segmentation.emissions import Features, thin
+from hmmseg.segmentation.emissions import MAX_RATE, Features, thin
 from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts
 
 MARGIN = 64  # numerics: rows read on either side of a part, for differences of its neighbours
@@ -50,13 +50,13 @@ class OnDisk:
             signals = differenced(signals)
         return part(signals, slice(start - low, stop - low))
 
-    def thinned(self, max_rate: float) -> Signals:
-        """All of it, at a rate of at most `max_rate` [Hz], as `thin` has it."""
+    def thinned(self) -> Signals:
+        """All of it, as `thin` has it."""
         rate = self.recording.rate
-        step = group_size(rate, max_rate)
+        step = group_size(rate, MAX_RATE)
         size = max(self.recording.piece // step, 1) * step
         pieces = [
-            thin(self.read(start, min(start + size, self.t.size)), max_rate, rate=rate)
+            thin(self.read(start, min(start + size, self.t.size)), rate=rate)
             for start in range(0, self.t.size, size)
         ]
         arrays = [name for name, value in vars(pieces[0]).items() if isinstance(value, np.ndarray)]
@@ -85,7 +85,7 @@ def round_tasks(task: BlockTask, number: int) -> list[BlockTask]:
 def cut(f: Features, task: BlockTask) -> list[float]:
     """Times [s] amid the free motions between the rounds of one recording, in order.
 
-    `f` need no more than conformity's MAX_RATE. A recording without a second round has none.
+    `f` need no more than emissions' MAX_RATE. A recording without a second round has none.
     """
     free = fit_free_contacts(f, any(move.slide for move in task.moves))
     steps = subtasks(one_round(task))

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hmmseg.hand.signals import Signals
-from hmmseg.levels import MOVED, SURE, TAIL, decisive
+from hmmseg.levels import MOVED, SETTLING, SURE, TAIL, decisive
 from hmmseg.robust import median_of_known, robust_sd
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 
@@ -128,7 +128,6 @@ def _depths(
 # chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
 SUPPORTED = 0.85
 FARTHEST = 0.5  # numerics: s; values further from a contact than any delay that is tried are not kept
-RINGS = 0.3  # chosen: s after a release in which a contact still rings
 
 
 @dataclass(frozen=True)
@@ -196,14 +195,14 @@ def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]
 def ringing(s: Signals, start: float, end: float, p: Parameters) -> list[tuple[float, float, float]]:
     """What loads still show [N] once the fingers have left a hold, or nothing: they ring, or come late.
 
-    Looked at is what follows its end up to RINGS while the fingers are farther apart than they were by more
-    than any pad gives, where there is no contact. The largest along the grip and in shear, and how far those
-    along the grip swing to either side, as what is late does not.
+    Looked at is what follows its end, while it settles and the fingers are farther apart than they were by
+    more than any pad gives, where there is no contact. The largest along the grip and in shear, and how far
+    those along the grip swing to either side, as what is late does not.
     """
     held = (s.t >= start) & (s.t <= end) & np.isfinite(s.distance)
     if not held.any():
         return []
-    after = (s.t > end) & (s.t <= end + RINGS)
+    after = (s.t > end) & (s.t <= end + SETTLING)
     left = after & (s.distance - np.median(s.distance[held]) > MOVED)
     force = (np.stack([s.fx1, s.fy1, s.fx2, s.fy2]) - np.asarray(p.bias)[:, None])[:, left]
     force = force[:, np.isfinite(force).all(axis=0)]

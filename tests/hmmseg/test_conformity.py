@@ -13,7 +13,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation import align as segmentation
-from hmmseg.segmentation.conformity import MAX_RATE, examine
+from hmmseg.segmentation.conformity import examine
 from hmmseg.segmentation.emissions import features, thin
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
@@ -154,7 +154,7 @@ def test_a_block_that_falls_while_it_halts_in_the_air_was_not_put_down(case, whi
     """Held still for three samples and then let go it would be placed, had the fingers opened."""
     found = read_case(RECORDINGS / case)
     fallen, expected = EDITS["drop_second"](found.trials[which], found.truth[which])
-    (verdict,) = examine([features(thin(task_space(fallen, found.rig), MAX_RATE), found.rig)], [found.task])
+    (verdict,) = examine([features(thin(task_space(fallen, found.rig)), found.rig)], [found.task])
     assert verdict.failing == expected
     assert verdict.log_odds > 5  # without a look at the fingers' distance -0.3
 
@@ -165,7 +165,7 @@ def test_pads_half_as_stiff_or_twice_as_stiff_as_stated_open_far_enough():
         values = {"normal_stiffness": 4000.0 * factor, "shear_stiffness": 2500.0 * factor}
         world = World("pads", Cell(rate=50.0), effects={"fingertip_compliance": values})
         for judged in trials_of(world, [70000, 70001]):
-            f = features(thin(task_space(judged.trial, judged.rig), MAX_RATE), judged.rig)
+            f = features(thin(task_space(judged.trial, judged.rig)), judged.rig)
             (verdict,) = examine([f], [task])
             assert verdict.failing is None and verdict.log_odds < -5
 
@@ -175,14 +175,14 @@ def test_a_tower_of_six_is_recognised_though_blocks_look_alike():
     more ways to call them than can be tried."""
     found, alike = list(replicates(WORLDS["6 blocks"], range(116_000, 116_002))), []
     for replicate in found:
-        f = features(thin(task_space(replicate.trials[0], replicate.rig), MAX_RATE), replicate.rig)
+        f = features(thin(task_space(replicate.trials[0], replicate.rig)), replicate.rig)
         (verdict,) = examine([f], [replicate.task])
         assert verdict.failing is None
         alike.append(len(verdict.free.blocks) < 6)
     assert any(alike)
     amid = float(found[0].boundaries[0][15:17].mean())  # in the release after the fourth move
     short = join(found[0].trials[0], (-np.inf, amid))
-    f = features(thin(task_space(short, found[0].rig), MAX_RATE), found[0].rig)
+    f = features(thin(task_space(short, found[0].rig)), found[0].rig)
     (verdict,) = examine([f], [found[0].task])
     assert verdict.failing == 17  # the fifth block's pickup
 
