@@ -140,7 +140,7 @@ def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
 
 
 LEAST = 3  # numerics: samples; of fewer there is no scatter
-WENT = 4  # numerics: smoothing windows of a hand that goes somewhere before what it bears is judged
+WENT = 8  # numerics: smoothing windows of a hand that goes somewhere before what it bears is judged
 
 
 @dataclass(frozen=True)
