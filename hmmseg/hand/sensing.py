@@ -265,16 +265,11 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     steps, together = steps[steps > 0], all(_rests(v, at) for v in others)
     if not steps.size or (together and name not in FORCE_CHANNELS):  # a hand that waits
         return 1.0
-    noise = noise_of(alive)
-    reach = max(_reach(v) for v in alive)
-    if noise <= ROUNDING * reach or whiteness(alive) > SCATTERS:
-        if stated is None or together:  # of no noise, or of motion above it
-            return 1.0
-        noise = stated
-    by_noise = float(steps.min()) / (2 * np.sqrt(np.pi) * noise)
+    if whiteness(alive) > SCATTERS and (stated is None or together):  # of no noise, or of motion above it
+        return 1.0
     differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
     pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
-    return min(max(by_noise, (repeats + 1) / (pairs + 2)), 1.0)
+    return (repeats + 1) / (pairs + 2)
 
 
 def _lives(values: np.ndarray) -> bool:
