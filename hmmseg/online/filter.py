@@ -53,8 +53,8 @@ from hmmseg.online.hypothesis import (
     read,
     widen,
 )
-from hmmseg.segmentation.boundaries import combine, normal
-from hmmseg.segmentation.changes import Disagreement, Prior, moment
+from hmmseg.segmentation.boundaries import evenly, normal
+from hmmseg.segmentation.changes import Prior, moment
 from hmmseg.segmentation.emissions import (
     MAX_RATE,
     WINDOW,
@@ -306,7 +306,7 @@ class Filter:
         near = (t[n + 1], t[n + 1] + DRIFTS) if touch else (t[n] - DRIFTS, t[n])
         contact = contacts(signals, sense([], [], (), parameters, self.rig), parameters)
         change = contact.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
-        out = combine(t, probability, {}) if change is None else moment(change, Disagreement())
+        out = evenly(t, probability) if change is None else moment(change)
         median = out.quantile(0.5)
         if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
             return None  # another event than the filter's

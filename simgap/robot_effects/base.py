@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from simgap.channels import Act, ChannelEffect, Theta
 from simgap.effect import Effect, Parameter
 from simgap.simulators.protocol import Channels, Simulator
 from simgap.simulators.recording import Recording
+
+NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
 
 Command = Callable[[Recording, Theta], Recording]
 Alter = Callable[[Recording, Channels, Theta], Channels]  # (window, channels as read so far, theta)
@@ -43,6 +46,10 @@ class RobotEffect(Effect):
     widened: float = 0.0
     by_log: bool = False
 
+    def label(self, short: str) -> str:
+        """A parameter's name: the effect's, and its own where that has several."""
+        return self.name if len(self.parameters) == 1 else f"{self.name}.{short}"
+
     @property
     def undoes(self) -> bool:
         """Whether starts are read through it, so that it is undone before they are."""
@@ -52,6 +59,15 @@ class RobotEffect(Effect):
     def reads(self) -> bool:
         """Whether it acts on read-outs alone and needs no rollout."""
         return self.read is not None or self.alter is not None
+
+
+def entry(parameter: Parameter, mean: float, sd: float) -> dict[str, Any]:
+    """What a document says of a parameter's posterior, the interval within bounds."""
+    low, high = max(mean - NORMAL_90 * sd, parameter.low), min(mean + NORMAL_90 * sd, parameter.high)
+    return {
+        "nominal": parameter.nominal, "mean": mean, "sd": sd, "interval_90": [low, high],
+        "unit": parameter.unit,
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)

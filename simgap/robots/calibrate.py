@@ -19,12 +19,11 @@ import numpy as np
 from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects import LACKING
-from simgap.robot_effects.base import RobotEffect
+from simgap.robot_effects.base import NORMAL_90, RobotEffect, entry
 from simgap.robots.fit import FINEST, Whiten, moved_to
-from simgap.robots.heldout import folds_of
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point, is_numeric
-from simgap.robots.rows import noises
+from simgap.robots.rows import folds_of, noises
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator
@@ -38,7 +37,6 @@ LEAVES = 4.0  # numerics: squares over the noise's, from which laws that a model
 UNTOLD = 0.5  # chosen: of a prior's sd; a parameter of which logs leave more is not told by them
 NOTHING = 0.05  # numerics: a correlation that is none
 COUPLED = 0.05  # numerics: of a direction that is not told, what a parameter must have in it to be of it
-NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
 
 
 @dataclass(frozen=True)
@@ -75,35 +73,28 @@ class Calibration:
         own = [k for k in every if not self.composed.numeric(self.names[k][0])]
         untold = [k for k in own if not self.told[k]]
         return {
-            "parameters": {self.label(k): self._entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
+            "parameters": {self.label(k): self.entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
             "reasons": {self.label(k): self._reason(k) for k in untold},
             "combinations": self.combinations(),
-            "numerics": {self.label(k): self._entry(k) for k in every if k not in own},
+            "numerics": {self.label(k): self.entry(k) for k in every if k not in own},
             "heldout": {"before": dict(self.before), "after": dict(self.after)},
         }
 
     def label(self, k: int) -> str:
-        """A parameter's name: its effect's, and its own where that has several."""
+        """A parameter's name."""
         effect, short = self.names[k]
-        return effect if len(self.composed.effects[effect].parameters) == 1 else f"{effect}.{short}"
+        return self.composed.effects[effect].label(short)
 
     def value(self, k: int) -> float:
         """A parameter where the fit ended."""
         effect, short = self.names[k]
         return float(self.point[effect][short])
 
-    def _entry(self, k: int) -> dict[str, Any]:
+    def entry(self, k: int) -> dict[str, Any]:
+        """A parameter in the document."""
         effect, short = self.names[k]
         known = self.composed.effects[effect].parameters[short]
-        mean, sd = self.value(k), float(np.sqrt(self.covariance[k, k]))
-        low, high = max(mean - NORMAL_90 * sd, known.low), min(mean + NORMAL_90 * sd, known.high)
-        return {
-            "nominal": known.nominal,
-            "mean": mean,
-            "sd": sd,
-            "interval_90": [low, high],
-            "unit": known.unit,
-        }
+        return entry(known, self.value(k), float(np.sqrt(self.covariance[k, k])))
 
     def _reason(self, k: int) -> str:
         others = [self.label(i) for i in self._group(k) if i != k]
@@ -201,7 +192,7 @@ def calibrate(
     if begin is None:
         linear = linearise(windows, point, [])
         whiten = covariances(windows, linear).whitener()
-        near, steps = moved_to(windows, linear, whiten, point, stated, STEPS).point, STEPS
+        near, steps = moved_to(windows, linear, whiten, point, stated, STEPS), STEPS
     tell("whole logs")
     whole = Composed.of(simulator, _stretches(recordings), mine, noise, LONGEST)
     start = min((near, point), key=lambda p: _cost(whole, p))
@@ -273,10 +264,10 @@ def _spread(composed: Composed) -> np.ndarray:
     return np.sqrt(np.maximum((np.bincount(channel, away**2) / count)[channel], composed.rows.variance))
 
 
-def _whitener(composed: Composed, linear: Linear) -> Whiten:
-    """Rows in units of what is left of their channel, what their log's uncertain start makes of them taken
-    off: (1 + U U')^(-1/2) by the singular values of U."""
-    scale, parts = _scales(composed, linear.residual), []
+def without_starts(composed: Composed, linear: Linear, scale: np.ndarray) -> Whiten:
+    """Rows in units of a scale (N,), what their log's uncertain start makes of them taken off:
+    (1 + U U')^(-1/2) by the singular values of U."""
+    parts = []
     for window, rows in zip(composed.windows, linear.rows.of, strict=True):
         doubt = [linear.starts[n][rows] * d for n, d in window.doubt.items()]
         if doubt:
@@ -293,6 +284,11 @@ def _whitener(composed: Composed, linear: Linear) -> Whiten:
     return whiten
 
 
+def _whitener(composed: Composed, linear: Linear) -> Whiten:
+    """Rows in units of what is left of their channel, less their starts."""
+    return without_starts(composed, linear, _scales(composed, linear.residual))
+
+
 def _least_squares(
     composed: Composed, point: Point, steps: int, free: Sequence[str]
 ) -> tuple[Point, Linear, Whiten]:
@@ -300,7 +296,7 @@ def _least_squares(
     whitened."""
     linear = linearise(composed, point, [])
     for _ in range(ROUNDS if steps == STEPS else 1):
-        point = moved_to(composed, linear, _whitener(composed, linear), point, free, steps).point
+        point = moved_to(composed, linear, _whitener(composed, linear), point, free, steps)
         linear = linearise(composed, point, [], linear.starts)
     return point, linear, _whitener(composed, linear)
 
@@ -331,7 +327,8 @@ def _held_out(
     """Root mean squares by channel of free runs along logs that a fit did not see, before and after."""
     rows, nominal = composed.rows, {n: composed.effects[n].neutral() for n in found}
     before = rows.observed - base_at(composed, nominal).rows
-    after, fold = np.full(rows.log.size, np.nan), folds_of_logs(composed)
+    every = range(len(composed.recordings))
+    after, fold = np.full(rows.log.size, np.nan), folds_of(rows, len(every), every)
     for number in np.unique(fold):
         mine = fold == number
         seen = composed.along(np.unique(rows.log[~mine]).tolist())
@@ -339,11 +336,6 @@ def _held_out(
         part = composed.along(np.unique(rows.log[mine]).tolist())
         after[mine] = rows.observed[mine] - base_at(part, point).rows
     return _rms(composed, before), _rms(composed, after)
-
-
-def folds_of_logs(composed: Composed) -> np.ndarray:
-    """The fold (N,) of each row: whole logs."""
-    return folds_of(composed.rows, len(composed.recordings), range(len(composed.recordings)))
 
 
 def _rms(composed: Composed, left: np.ndarray) -> dict[str, float]:

@@ -45,29 +45,30 @@ from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
+from simgap.robots.fit import Local, descended
 from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point, is_numeric
 from simgap.robots.rows import noises
 from simgap.robots.unchanged import (
-    WIDER,
+    FAR,
     Broken,
     Coordinates,
-    Local,
     Old,
     Runs,
-    descended,
     halved,
     learned,
     loss,
     units_of,
     without_broken,
 )
+from simgap.robots.verdict import repeated
 from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
 STAGES = 8  # look: what a progress bar counts
 LADDER = (-1.2, -0.6, -0.25, 0.25, 0.6, 1.2)  # numerics: changes to rank candidates by
+WIDER = 8.0  # numerics: scales that a change is sought by first: far from it all of a log is a tail
 RUNGS = np.linspace(-2.1, 2.1, 43)  # numerics: from which one is fitted; a free swing has narrow valleys
 TRIED, PAIRED, SECOND = 5, 2, 4  # numerics: changes fitted exactly, of those joined in pairs, and with them
 CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
@@ -100,122 +101,112 @@ class Change:
         return min(1.0, self.x.size * float(each.min()))
 
 
+@dataclass(frozen=True)
+class Hypothesis:
+    """What some `effects` may have changed: `of`, coordinates of all that is fitted and of the effects, and
+    which of them are the effects' (`mine`). Its own coordinates z are OLD's theta (p,) and changes (k,)."""
+
+    runs: Runs
+    old: Old
+    effects: tuple[str, ...]
+    of: Coordinates
+    mine: np.ndarray
+
+    @classmethod
+    def about(cls, runs: Runs, old: Old, effects: tuple[str, ...]) -> Hypothesis:
+        """Of these effects."""
+        fitted = [*dict.fromkeys(e for e, _ in old.theta.names)]
+        of = Coordinates.of(runs.composed, old.point, [*dict.fromkeys((*fitted, *effects))])
+        mine = [of.names.index(n) for e in effects for n in of.names if n[0] == e]
+        return cls(runs, old, effects, of, np.array(mine, int))
+
+    def full(self, z: np.ndarray) -> np.ndarray:
+        """NEW's coordinates."""
+        p, full = len(self.old.theta.names), np.zeros(len(self.of.names))
+        full[:p] = z[:p]
+        full[self.mine] += z[p:]
+        return full
+
+    def point(self, z: np.ndarray) -> Point:
+        """NEW's parameters."""
+        return self.of.point(self.old.point, self.full(z))
+
+    def cost(self, z: np.ndarray, without: int = -1) -> float:
+        """Minus the log likelihood of NEW, `without` one of its units, and, as a quadratic, of OLD."""
+        theta = z[: len(self.old.theta.names)]
+        kept = self.runs.losses(self.point(z), without)[0]
+        return kept + float(0.5 * theta @ self.old.bend @ theta)
+
+    def columns(self, z: np.ndarray, only: Sequence[str] | None = None) -> np.ndarray:
+        """Derivatives (N, p + k) of NEW's rows; of `only` some effects where these are named, else 0."""
+        slopes = self.runs.slopes(self.point(z), self.of, self.full(z), only)
+        theta = slopes[:, : len(self.old.theta.names)]
+        return np.hstack([theta if only is None else np.zeros_like(theta), slopes[:, self.mine]])
+
+
 class Comparison:
     """NEW logs against what is known of OLD: exact fits of changes."""
 
     def __init__(self, composed: Composed, old: Old, candidates: Sequence[str], unit: np.ndarray) -> None:
         self.composed, self.old, self.candidates = composed, old, candidates
         self.runs = Runs(composed, old.point, unit, old.scale)
-        self.p = len(old.theta.names)
-
-    def _coordinates(self, effects: Sequence[str]) -> tuple[Coordinates, np.ndarray]:
-        """Of all that is fitted and of some effects, and which of them are the effects'."""
-        fitted = [*dict.fromkeys(e for e, _ in self.old.theta.names)]
-        both = [*fitted, *(e for e in effects if e not in fitted)]
-        of = Coordinates.of(self.composed, self.old.point, both)
-        return of, np.array([of.names.index(n) for e in effects for n in of.names if n[0] == e], int)
-
-    def _at(self, z: np.ndarray, of: Coordinates, mine: np.ndarray) -> np.ndarray:
-        """NEW's coordinates, of theta (p,) and changes (k,)."""
-        full = np.zeros(len(of.names))
-        full[: self.p] = z[: self.p]
-        full[mine] += z[self.p :]
-        return full
-
-    def cost(self, z: np.ndarray, of: Coordinates, mine: np.ndarray) -> float:
-        """Minus the log likelihood of NEW and, as a quadratic, OLD."""
-        rows, theta = self.runs.rows(of.point(self.old.point, self._at(z, of, mine))), z[: self.p]
-        if not np.isfinite(rows).all():
-            return np.inf
-        bend = self.old.information.sum(0) + self.old.prior
-        return float(loss(rows).sum() + 0.5 * theta @ bend @ theta)
-
-    def _columns(
-        self, z: np.ndarray, of: Coordinates, mine: np.ndarray, effects: Sequence[str] | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Rows (N,) and columns (N, p + k); theta's are 0 where only the `effects`' are wanted."""
-        full = self._at(z, of, mine)
-        point = of.point(self.old.point, full)
-        slopes = self.runs.slopes(point, of, full, effects)
-        theta = slopes[:, : self.p] if effects is None else np.zeros((slopes.shape[0], self.p))
-        return self.runs.rows(point), np.hstack([theta, slopes[:, mine]])
-
-    def _without(
-        self, z: np.ndarray, of: Coordinates, mine: np.ndarray, new: int, step: np.ndarray, old: np.ndarray
-    ) -> np.ndarray:
-        """Where theta and changes go by a step without a unit of NEW (none: -1) and units of OLD."""
-        bend = self.old.information[~old].sum(0) + self.old.prior
-        pull = self.old.pull[~old].sum(0) - self.old.pull.sum(0)
-
-        def cost(there: np.ndarray) -> float:
-            theta = there[: self.p]
-            kept = self.runs.losses(of.point(self.old.point, self._at(there, of, mine)), new)[0]
-            return kept + float(0.5 * theta @ bend @ theta - pull @ theta)
-
-        return halved(cost, z, step)
 
     def fit(self, effects: tuple[str, ...], starts: Sequence[np.ndarray]) -> Change:
         """An explanation, from the best of some starts of its coordinates."""
-        of, mine = self._coordinates(effects)
-        p, k = self.p, mine.size
-        bend = np.zeros((p + k, p + k))
-        bend[:p, :p] = self.old.information.sum(0) + self.old.prior
-        bend[range(p, p + k), range(p, p + k)] = 1e-6
+        old, runs, of = self.old, self.runs, Hypothesis.about(self.runs, self.old, effects)
+        p, k = len(old.theta.names), of.mine.size
+        bend = 1e-6 * np.eye(p + k)
+        bend[:p, :p] = old.bend
         begun = [np.concatenate([np.zeros(p), x]) for x in starts]
-        for wider in (WIDER[0], 1.0):
-            self.runs.scaled(wider * self.old.scale)
-            z = min(begun, key=lambda z: self.cost(z, of, mine))
-            theta = self._columns(z, of, mine)[1]
+        for wider in (WIDER, 1.0):
+            runs.scaled(wider * old.scale)
+            z = min(begun, key=of.cost)
+            theta = of.columns(z)
             theta[:, p:] = 0.0
 
             def local(z: np.ndarray, theta=theta) -> Local:  # theta moves little, and its columns less
-                rows, columns = self._columns(z, of, mine, effects)
-                information, pull = self.runs.told(rows, theta + columns)
+                information, pull = runs.told(runs.rows(of.point(z)), theta + of.columns(z, effects))
                 return information.sum(0) + bend, pull.sum(0) - bend @ z
 
-            z = descended(lambda z: self.cost(z, of, mine), local, z)
+            z = descended(of.cost, local, z, far=FAR)
             begun = [z]
-        information, pull = self.runs.told(*self._columns(z, of, mine))
+        information, pull = runs.told(runs.rows(of.point(z)), of.columns(z))
         total, rest = information.sum(0) + bend, pull.sum(0) - bend @ z
-        left = np.zeros(len(self.runs.units))
-        moved = [np.zeros((n, k)) for n in map(len, (self.runs.units, self.old.units))]
-        none = np.zeros(len(self.old.units), bool)
-        for number in range(len(self.runs.units)):
-            step = np.linalg.lstsq(total - information[number], rest - pull[number], rcond=None)[0]
-            there = self._without(z, of, mine, number, step, none)
-            left[number] = self.runs.losses(of.point(self.old.point, self._at(there, of, mine)), number)[1]
-            moved[0][number] = (there - z)[p:]
-        for number in range(len(self.old.units) if k else 0):
-            without = np.arange(len(self.old.units)) == number
+        left = np.zeros(len(runs.units))
+        moved = [np.zeros((n, k)) for n in map(len, (runs.units, old.units))]
+        for u in range(left.size):
+            step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
+            there = halved(lambda z, u=u: of.cost(z, u), z, step)
+            left[u], moved[0][u] = runs.losses(of.point(there), u)[1], (there - z)[p:]
+        for u in range(len(old.units)):
             less, push = total.copy(), rest.copy()
-            less[:p, :p] -= self.old.information[number]
-            push[:p] -= self.old.pull[number] - self.old.information[number] @ z[:p]
-            step = np.linalg.lstsq(less, push, rcond=None)[0]
-            moved[1][number] = (self._without(z, of, mine, -1, step, without) - z)[p:]
-        pushed = np.sqrt(self.old.dependence * np.diag(self.old.prior))  # by a prior's mean one sd away
+            less[:p, :p] -= old.information[u]
+            push[:p] -= old.pull[u] - old.information[u] @ z[:p]
+            moved[1][u] = np.clip(np.linalg.lstsq(less, push, rcond=None)[0][p:], -FAR, FAR)
+        pushed = np.sqrt(old.dependence * np.diag(old.prior))  # by a prior's mean one sd away
         by_prior = np.linalg.solve(total, np.eye(p + k, p) * pushed)
-        own = {of.names[m] for m in mine}
-        drift = np.array([0.0 if n in own else DRIFT**2 for n in self.old.theta.names])
-        by_drift = added_by_drift(total, bend[:p, :p], drift / self.old.dependence) * self.old.dependence
+        own = {of.of.names[m] for m in of.mine}
+        drift = np.array([0.0 if n in own else DRIFT**2 for n in old.theta.names])
+        by_drift = added_by_drift(total, bend[:p, :p], drift / old.dependence) * old.dependence
         x = z[p:]
         known = (np.sum(by_prior**2, 1) + by_drift)[p:] + (RESPONSE * x) ** 2
         sd, freedom = jackknife(moved, known)
         schur = total[p:, p:] - total[p:, :p] @ np.linalg.solve(total[:p, :p], total[:p, p:])
         occam = float(np.sum(np.log(np.pi * (1 + x**2)))) - 0.5 * k * np.log(2 * np.pi)
-        occam += 0.5 * float(np.linalg.slogdet(schur / self.old.dependence + np.eye(k))[1]) if k else 0.0
-        energy = self.cost(z, of, mine) / self.old.dependence + occam
-        return Change(effects, x, sd, freedom, energy, left, z[:p])
+        occam += 0.5 * float(np.linalg.slogdet(schur / old.dependence + np.eye(k))[1]) if k else 0.0
+        return Change(effects, x, sd, freedom, of.cost(z) / old.dependence + occam, left, z[:p])
 
     def scanned(self, about: Change | None = None) -> dict[str, tuple[float, np.ndarray]]:
         """By candidate the least cost over a ladder of changes of it, theta held, and where that is."""
-        out, known, first = {}, () if about is None else about.effects, np.zeros(self.p)
+        out, known, first = {}, () if about is None else about.effects, np.zeros(len(self.old.theta.names))
         if about is not None:
             first = np.concatenate([about.theta, about.x])
+        self.runs.scaled(WIDER * self.old.scale)
         for name in (n for n in self.candidates if n not in known):
-            of, mine = self._coordinates((*known, name))
-            k = self.p + mine.size - first.size
+            of = Hypothesis.about(self.runs, self.old, (*known, name))
+            k = len(self.old.theta.names) + of.mine.size - first.size
             steps = [np.zeros(k), *(s * one for one in np.eye(k) for s in LADDER)]
-            costs = [self.cost(np.concatenate([first, x]), of, mine) for x in steps]
+            costs = [of.cost(np.concatenate([first, x])) for x in steps]
             out[name] = (min(costs), steps[int(np.argmin(costs))])
         return out
 
@@ -261,7 +252,6 @@ class Comparison:
     def searched(self) -> list[Change]:
         """Nothing, the most promising single changes, and pairs about the best of them."""
         nothing = self.fit((), [np.zeros(0)])
-        self.runs.scaled(WIDER[0] * self.old.scale)
         scan = self.scanned()
         names = sorted(scan, key=lambda n: scan[n][0])[:TRIED]
         singles = [self.fit((n,), [scan[n][1], *self._rungs(scan[n][1])]) for n in names]
@@ -269,7 +259,6 @@ class Comparison:
         best = [c for c in fit if self.needed(c, nothing)][:PAIRED]
         if not best:
             return [nothing, *singles]
-        self.runs.scaled(WIDER[0] * self.old.scale)
         scan = self.scanned(best[0])
         pairs = {}
         for name in sorted(scan, key=lambda n: scan[n][0])[:SECOND]:
@@ -392,7 +381,7 @@ class Changes:
         for name in effects:
             shorts = self.composed.effects[name].parameters
             for short in shorts:
-                size = known[name if len(shorts) == 1 else f"{name}.{short}"]
+                size = known[self.composed.effects[name].label(short)]
                 out[short if len(effects) == 1 else f"{name}.{short}"] = size | {"nominal": size["old"]}
         return out
 
@@ -405,10 +394,7 @@ class Changes:
         apart = min((np.abs(c.left - self.best.left) * count for c in self.others), key=np.sum)
         unit = self.runs.units[int(apart.argmax())]
         log = self.composed.recordings[int(self.runs.log[self.runs.unit == unit][0])].name
-        return {
-            "do": f"repeat the motion of {log}", "log": log, "separates": list(separates),
-            "expected_gain_nats": float(apart.max()),
-        } if apart.max() > 1 else None  # fmt: skip
+        return repeated(log, separates, float(apart.max()))
 
     @property
     def over(self) -> float:
@@ -458,10 +444,8 @@ class Changes:
         low, now, high = (at.values(change.x + r) for r in (-reach, 0 * reach, reach))
         out = {}
         for k, (effect, short) in enumerate(at.names):
-            known = self.composed.effects[effect]
-            name = effect if len(known.parameters) == 1 else f"{effect}.{short}"
-            ratio = at.log[k]
-            out[name] = {
+            known, ratio = self.composed.effects[effect], at.log[k]
+            out[known.label(short)] = {
                 "old": float(at.at[k]), "mean": float(now[k]),
                 "sd": float(min(change.sd[k], 1e6) * at.slopes(change.x)[k]),
                 "interval_90": [float(low[k]), float(high[k])], "unit": known.parameters[short].unit,

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from simgap.attribution.verdict import entries, rows
+from simgap.robot_effects.base import entry
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.robots.search import Settled
 
 SEEN = 3.0  # chosen: standard deviations of noise's squares: a smaller gap of a phase is none
-NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
 
 
 def body(found: RobotDiagnosis) -> dict[str, Any]:
@@ -30,17 +30,10 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
         "stands_in": {c: list(others) for c, others in v.stands_in.items()},
         "effects": _effects(found),
         "fitted": _fitted(found, numeric=False),
-        "discrepancy": dict(found.best.discrepancy.scale),
+        "discrepancy": dict(found.best.discrepancy),
         "identifiability": found.identifiable.body(),
         "shrinkage": _shrinkage(found),
-        "next_experiment": None
-        if found.next_log is None
-        else {
-            "do": f"repeat the motion of {found.next_log.log}",
-            "log": found.next_log.log,
-            "separates": list(found.next_log.separates),
-            "expected_gain_nats": found.next_log.gain,
-        },
+        "next_experiment": found.next_log,
     }
 
 
@@ -85,10 +78,8 @@ def parameters(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) ->
     out: dict[str, dict[str, Any]] = {}
     for name in effects:
         for short, p in found.composed.effects[name].parameters.items():
-            m, s = mean[name, short], sd[name, short]
-            low, high = max(m - NORMAL_90 * s, p.low), min(m + NORMAL_90 * s, p.high)
             key = short if len(effects) == 1 else f"{name}.{short}"
-            out[key] = {"mean": m, "sd": s, "interval_90": [low, high], "unit": p.unit, "nominal": p.nominal}
+            out[key] = entry(p, mean[name, short], sd[name, short])
     return out
 
 
@@ -120,12 +111,10 @@ def _fitted(found: RobotDiagnosis, numeric: bool) -> dict[str, Any]:
     for name, before in found.plain.point.items():
         if found.composed.numeric(name) is not numeric:
             continue
+        effect = found.composed.effects[name]
         for short, value in before.items():
-            out[name if len(before) == 1 else f"{name}.{short}"] = {
-                "before": value,
-                "after": found.linear.point[name][short],
-                "unit": found.composed.effects[name].parameters[short].unit,
-            }
+            after, unit = found.linear.point[name][short], effect.parameters[short].unit
+            out[effect.label(short)] = {"before": value, "after": after, "unit": unit}
     return out
 
 
@@ -134,17 +123,13 @@ def _shrinkage(found: RobotDiagnosis) -> dict[str, Any] | None:
     if far is None:
         return None
     units = {n: c.unit for n, c in found.composed.simulator.channels.items()}
+    of = "held-out logs" if len(found.composed.recordings) > 2 else "held-out stretches"
     return {
-        "evaluated_on": "held-out logs" if len(found.composed.recordings) > 2 else "held-out stretches",
-        "before": far.before,
-        "after": far.after,
-        "noise_floor": far.noise_floor,
-        "fraction": far.fraction,
-        "interval_90": list(far.interval_90),
-        "flexible_ceiling": None,
+        "evaluated_on": of, "before": far.before, "after": far.after, "noise_floor": far.noise_floor,
+        "fraction": far.fraction, "interval_90": list(far.interval_90), "flexible_ceiling": None,
         "rms": {n: {"before": a, "after": b, "unit": units[n]} for n, (a, b) in far.rms.items()},
         "by_phase": _by_phase(found, units),
-    }
+    }  # fmt: skip
 
 
 def _by_phase(found: RobotDiagnosis, units: dict[str, str]) -> dict[str, Any]:

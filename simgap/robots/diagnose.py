@@ -6,22 +6,23 @@ logs that took no part, verdict, next experiment; `describe` makes the document.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from hmmseg.errors import InputError, nearest
 from simgap.progress import Progress, silent
 from simgap.robot_effects import STATED, UNMEASURED, doubted, effects_of
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.heldout import Shrinkage, folds_of, shrinkage
+from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.linear import Linear
-from simgap.robots.model import Composed, Point, is_numeric, motions
+from simgap.robots.model import Composed, Point, is_numeric
 from simgap.robots.phases import Phases, phases_of
-from simgap.robots.rows import noises
+from simgap.robots.rows import folds_of, noises
 from simgap.robots.search import Search, Settled
 from simgap.robots.sets import Identifiability
-from simgap.robots.verdict import NextLog, RobotVerdict, next_log, verdict_on
+from simgap.robots.verdict import RobotVerdict, next_log, verdict_on
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
@@ -41,7 +42,7 @@ class RobotDiagnosis:
     verdict: RobotVerdict
     shrinkage: Shrinkage | None
     identifiable: Identifiability
-    next_log: NextLog | None
+    next_log: dict[str, Any] | None
     calibrated: Calibration | None
     warnings: tuple[str, ...]
 
@@ -96,10 +97,16 @@ def diagnose(
             raise InputError(f"--effect {name}", "is no candidate", nearest(name, list(effects)))
     length = getattr(simulator, "window", None) if length is None else length
     given = {} if length is None else {"length": length}
-    calibrated = _Calibrated(simulator, recordings, effects, length)
+
+    def calibrated(patterns: Sequence[str], begin: Point | None = None) -> Calibration | None:
+        """With what models state or lack and nobody measured fitted; None where there is nothing of it."""
+        wide = doubted(effects, patterns, getattr(simulator, "sd", {}))
+        if not any(e.fitted and not is_numeric(simulator, e) for e in wide.values()):
+            return None
+        return calibrate(simulator, recordings, wide, length=length, begin=begin, judged=False)
+
     whole = Composed.of(simulator, recordings, effects, noise, **given)
-    whole = replace(whole, motion=motions(whole))
-    parts = phases_of(simulator, recordings) if phases is None else phases
+    parts = phases_of(simulator, recordings, whole.windows) if phases is None else phases
     # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
     # is not to be outvoted by it, and what it tells is asked where those tell nothing.
     every = [whole] if forced or (calm := whole.calm()) is whole else [calm, whole]
@@ -112,42 +119,10 @@ def diagnose(
     return found
 
 
-class _Calibrated:
-    """The model with what nobody measured fitted: `found`, None where there is nothing of the kind or before
-    it was sought."""
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        recordings: Sequence[Recording],
-        effects: Mapping[str, RobotEffect],
-        length: float | None,
-    ) -> None:
-        self._given = simulator, recordings, effects, length
-        self.found: Calibration | None = None
-
-    def __call__(self) -> Point:
-        """By all that nobody measured and that models lack, from the model as it comes: for where a search
-        from there leaves a gap."""
-        self.found = self._by(UNMEASURED, None)
-        return {} if self.found is None else self.found.point
-
-    def about(self, point: Point) -> Calibration | None:
-        """Where no search needed it, by what models state about the point that one found."""
-        return self.found or self._by(STATED, point)
-
-    def _by(self, patterns: Sequence[str], begin: Point | None) -> Calibration | None:
-        simulator, recordings, effects, length = self._given
-        wide = doubted(effects, patterns, getattr(simulator, "sd", {}))
-        if not any(e.fitted and not is_numeric(simulator, e) for e in wide.values()):
-            return None
-        return calibrate(simulator, recordings, wide, length=length, begin=begin, judged=False)
-
-
 def _diagnosed(
     composed: Composed,
     phases: Phases,
-    calibrated: _Calibrated,
+    calibrated: Callable[..., Calibration | None],
     forced: Sequence[str],
     seed: int,
     tell: Progress,
@@ -163,7 +138,7 @@ def _diagnosed(
 
     wanted = tuple(n for n, e in composed.effects.items() if not e.fitted)
     fold = folds_of(composed.rows, len(composed.recordings), groups)
-    search = Search(composed, wanted, fold, calibrated)
+    search = Search(composed, wanted, fold, lambda: calibrated(UNMEASURED))
     best = search.forced(tuple(forced)) if forced else search.run(tell)
     nothing = search.known[frozenset()]
     for name in search.diverged:
@@ -180,5 +155,6 @@ def _diagnosed(
     tell("calibration")
     return RobotDiagnosis(
         composed, phases, search, best, verdict, far if verdict.causes else None, search.identifiable,
-        next_log(search, best, verdict), calibrated.about(best.point), tuple(warnings),
+        next_log(search, best, verdict), search.calibration or calibrated(STATED, best.point),
+        tuple(warnings),
     )  # fmt: skip

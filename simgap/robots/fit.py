@@ -17,21 +17,46 @@ Whiten = Callable[[np.ndarray], np.ndarray]  # rows (N,) or columns (N, k)
 STEPS = 8  # numerics: of a least-squares fit, at most
 HALVINGS = 5  # numerics: of a step that straight lines took too far
 FLAT = 1e-12  # numerics: of the usual bend, so that one that is none in some direction has a least
-SHORTEN, SHORTER = (
-    0.1,
-    10.0,
-)  # numerics: damping of a step that was too long, and by how much more of the next
+SHORTEN, SHORTER = 0.1, 10.0  # numerics: damping of a step that was too long, and factor of the next one's
 CLOSE = 0.05  # numerics: nats that a step must gain for a fit to go on
 WIDE = 3.0  # numerics: posterior standard deviations: a finite difference
 FINEST = 1e-4  # numerics: usual sizes: the least one
 
 
-@dataclass(frozen=True)
-class Fit:
-    """Where a set fits best, and what that `gained` over where the fit began [nats]."""
+Cost = Callable[[np.ndarray], float]  # of coordinates x (n,) [nats]
+Local = tuple[np.ndarray, np.ndarray]  # its curvature (n, n) and pull (n,) there
 
-    point: Point
-    gained: float
+
+def descended(
+    cost: Cost,
+    local: Callable[[np.ndarray], Local],
+    x: np.ndarray,
+    low: np.ndarray | float = -np.inf,
+    high: np.ndarray | float = np.inf,
+    steps: int = STEPS,
+    far: float = np.inf,
+) -> np.ndarray:
+    """Where a cost is least within bounds, from x (n,): by steps of Levenberg and Marquardt (J. SIAM 11,
+    1963), each the minimum within bounds and at most so `far` in each coordinate."""
+    now, damping = cost(x), 0.0
+    for _ in range(steps if x.size and np.isfinite(now) else 0):
+        bend, pull = local(x)
+        usual = np.diag(np.maximum(np.diag(bend), 1.0))
+        # About x, so that what is held at a bound stays exactly there.
+        box = np.maximum(low - x, -far), np.minimum(high - x, far)
+        for _ in range(HALVINGS):
+            move, _ = least(bend + (damping + FLAT) * usual, pull, *box)
+            there = cost(x + move)
+            if there < now:
+                break
+            damping = max(SHORTER * damping, SHORTEN)
+        else:
+            break
+        x, gained, now = x + move, now - there, there
+        damping = damping / SHORTER if damping > SHORTEN else 0.0
+        if gained < CLOSE * (1 + CLOSE * now):
+            break
+    return x
 
 
 def moved_to(
@@ -41,42 +66,20 @@ def moved_to(
     point: Point,
     only: Sequence[str] | None = None,
     steps: int = STEPS,
-) -> Fit:
+) -> Point:
     """The point of least squares of whitened residuals, from a start; priors as in attribution. `only`: the
     effects that are moved, all by default.
 
-    Steps are Levenberg's and Marquardt's (J. SIAM 11, 1963), each the minimum within bounds. A start that
-    straight lines took too far, so that it is worse than where they begin, is taken back by halves towards
-    there.
+    A start that straight lines took too far, so that it is worse than where they begin, is taken back by
+    halves towards there.
     """
     free = {e: theta for e, theta in point.items() if only is None or e in only}
     held = {e: theta for e, theta in point.items() if e not in free}
     if not any(free.values()):
-        return Fit(point, 0.0)
+        return point
     squares = _Squares(composed, linear, whiten, held, free)
-    x = squares.reached()
-    first = cost = squares.cost(x)
-    if not np.isfinite(first):
-        return Fit(point, 0.0)
-    damping = 0.0
-    for _ in range(steps):
-        jacobian, left = squares.jacobian(x), squares.residual(x)
-        bend, pull = jacobian.T @ jacobian, -jacobian.T @ left
-        usual = np.diag(np.maximum(np.diag(bend), 1.0))
-        for _ in range(HALVINGS):
-            # About x, so that what is held at a bound stays exactly there.
-            move, _ = least(bend + (damping + FLAT) * usual, pull, squares.low - x, squares.high - x)
-            there = squares.cost(x + move)
-            if there < cost:
-                break
-            damping = max(SHORTER * damping, SHORTEN)
-        else:
-            break
-        x, gained, cost = x + move, cost - there, there
-        damping = damping / SHORTER if damping > SHORTEN else 0.0
-        if gained < CLOSE * (1 + CLOSE * cost):
-            break
-    return Fit({**point, **squares.at(x)}, first - cost)
+    x = descended(squares.cost, squares.local, squares.reached(), squares.low, squares.high, steps)
+    return {**point, **squares.at(x)}
 
 
 @dataclass
@@ -151,6 +154,11 @@ class _Squares:
     def cost(self, x: np.ndarray) -> float:
         """Half the squares [nats]."""
         return 0.5 * float(np.sum(self.residual(x) ** 2))
+
+    def local(self, x: np.ndarray) -> Local:
+        """Curvature and pull."""
+        jacobian, left = self.jacobian(x), self.residual(x)
+        return jacobian.T @ jacobian, -jacobian.T @ left
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Derivatives of `residual` by x."""

@@ -1,4 +1,4 @@
-"""What logs that took no part say of a set: how far the gap shrinks on them, and which logs are held out."""
+"""What logs that took no part say of a set: how far the gap shrinks on them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,8 @@ from simgap.attribution.heldout import fraction_gone
 from simgap.robots.fit import moved_to
 from simgap.robots.linear import base_at, linearise
 from simgap.robots.model import Composed, Point
-from simgap.robots.rows import Rows
 from simgap.robots.search import Settled
 from simgap.robots.whiten import covariances
-
-FOLDS = 6  # numerics: parts that are held out in turn; each fit keeps five sixths
 
 
 @dataclass(frozen=True)
@@ -36,23 +33,6 @@ class Shrinkage:
     plain: np.ndarray
     residual: np.ndarray
     squares: np.ndarray
-
-
-def folds_of(rows: Rows, num_logs: int, groups: Sequence[int] | None = None) -> np.ndarray:
-    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches. With
-    `groups` (num_logs,), logs of one number are held out together."""
-    if groups is not None:
-        return np.unique(np.asarray(groups)[rows.log], return_inverse=True)[1]
-    if num_logs >= 3:
-        return rows.log % min(num_logs, FOLDS)
-    stretches = max(2, FOLDS // num_logs)
-    out = np.zeros(rows.log.size, int)
-    for log in range(num_logs):
-        mine = rows.log == log
-        window = rows.window[mine]
-        first, count = int(window.min()), int(np.ptp(window)) + 1
-        out[mine] = log * stretches + (window - first) * stretches // count
-    return np.unique(out, return_inverse=True)[1]
 
 
 def shrinkage(best: Settled, nothing: Settled, composed: Composed, fold: np.ndarray) -> Shrinkage | None:
@@ -98,4 +78,4 @@ def _fitted(part: Composed, one: Settled, point: Point, only: Sequence[str] | No
     if not point:
         return point
     linear = linearise(part, point, [])
-    return moved_to(part, linear, covariances(part, linear).whitener(one.discrepancy), point, only).point
+    return moved_to(part, linear, covariances(part, linear).whitener(one.discrepancy), point, only)

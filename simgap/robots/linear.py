@@ -84,17 +84,9 @@ def linearise(
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
     residual = composed.rows.observed - base.rows
     starts = _by_start(composed, base) if starts is None else starts
-    found = Linear(
-        point,
-        composed.rows,
-        residual,
-        starts,
-        {},
-        (),
-        sum(c is None for c in base.read),
-        _rates(composed, base),
-        composed.wobble,
-    )
+    dropped = sum(channels is None for channels in base.read)
+    rates, wobble = _rates(composed, base), composed.wobble
+    found = Linear(point, composed.rows, residual, starts, {}, (), dropped, rates, wobble)
     moved, diverged = {}, []
     for number, name in enumerate(effects):
         say(f"{number + 1} of {len(effects)}, {name}")

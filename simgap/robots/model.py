@@ -12,6 +12,7 @@ from simgap.robots.rows import Rows, rows_of
 from simgap.robots.windows import LENGTH, RESTS, STRIKES, Window, cut, start_of
 from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
+from simgap.simulators.user import restarts
 
 # numerics: windows of a regime from which on a search takes some of them alone
 FIRST = 48
@@ -26,9 +27,9 @@ class Composed:
 
     `wobble` (N, K): by how much every effect of its usual size moves the rows of windows in which bodies
     move in contact; None where there is none. `motion`: a number for every log's motion, the same in repeats
-    (see `repeats`); none where no logs are. How rows move with the simulator's own numbers (its step, how it
-    holds commands) hardly depends on where: that is taken as it is at the point `about`, and what would
-    cost another run (a finer step) is in proportion to it.
+    (see `motions`); none where windows begin anew from states of their own. How rows move with the
+    simulator's own numbers (its step, how it holds commands) hardly depends on where: that is taken as it is
+    at the point `about`, and what would cost another run (a finer step) is in proportion to it.
     """
 
     simulator: Simulator
@@ -53,7 +54,9 @@ class Composed:
     ) -> Composed:
         """With windows of about `length` [s] cut, and their rows laid out."""
         windows = tuple(cut(simulator, recordings, noise, length))
-        return cls(simulator, tuple(recordings), windows, effects, noise, rows_of(recordings, windows, noise))
+        rows = rows_of(recordings, windows, noise)
+        motion = () if restarts(simulator) else tuple(motions(simulator, recordings))
+        return cls(simulator, tuple(recordings), windows, effects, noise, rows, motion=motion)
 
     def along(self, logs: Sequence[int]) -> Composed:
         """The same along some of the logs alone, which keep their numbers."""
@@ -227,10 +230,6 @@ class Composed:
     def _acting(self, point: Point) -> list[tuple[RobotEffect, dict[str, float]]]:
         return [(self.effects[n], {**self.effects[n].neutral(), **v}) for n, v in point.items()]
 
-    def run(self, point: Point) -> list[Channels | None]:
-        """True channels of every window."""
-        return self.rolled(point, self.starts(point))
-
 
 def is_numeric(simulator: Simulator, effect: RobotEffect) -> bool:
     """Whether an effect is of the simulator's own numerics: its step, how it holds commands."""
@@ -264,34 +263,27 @@ def _read(acting: Sequence, stretch: Recording, begin: float, true: Channels) ->
 
 
 # A model's error is the same each time the same motion is made: twelve repeats tell of it what one does, and
-# only of the sensors' noise twelve times as much. Where a simulator is restarted in windows, each begins from
-# a state of its own; where it is not, logs to which it answers alike are repeats.
+# only of the sensors' noise twelve times as much.
+
+ALIKE = 0.1  # chosen: of a command's usual size; logs whose commands are closer than this are of one motion
 
 
-def motions(composed: Composed) -> tuple[int, ...]:
-    """A number for every log's motion: the same where the simulator answers the same to within the sensors'
-    noise. None where it is restarted in windows."""
-    logs = [w.log for w in composed.windows]
-    if any(w.start is not None for w in composed.windows) or len({*logs}) < len(logs):
-        return ()
-    found: list[tuple[np.ndarray, Channels]] = []
-    out = [-1] * len(composed.recordings)
-    for window, answer in zip(composed.windows, composed.run({}), strict=True):
-        t = composed.recordings[window.log].window(window.begin, window.end).t
-        since = t - t[0]
-        mine = None if answer is None else (since, answer)
-        same = (k for k, other in enumerate(found) if mine and _alike(mine, other, composed.noise))
-        out[window.log] = next(same, len(found))
-        if out[window.log] == len(found):
-            found.append(mine or (since, {}))
-    return tuple(out)
+def motions(simulator: Simulator, recordings: Sequence[Recording]) -> list[int]:
+    """A number for every log's motion: the same where its commands are the same. Without commands each log is
+    a motion of its own."""
+    names = [n for n, c in simulator.channels.items() if c.kind == "command"]
+    every = {n: np.concatenate([log[n] for log in recordings]) for n in names}
+    size = {n: max(float(np.std(v) + abs(np.mean(v))), 1e-300) for n, v in every.items()}
 
+    def alike(one: Recording, other: Recording) -> bool:
+        t, u = one.t - one.t[0], other.t - other.t[0]
+        both = t <= min(t[-1], u[-1])
+        apart = {n: one[n][both] - np.interp(t[both], u, other[n]) for n in names}
+        return bool(names) and all(np.sqrt(np.mean(d**2)) < ALIKE * size[n] for n, d in apart.items())
 
-def _alike(one: tuple[np.ndarray, Channels], other: tuple[np.ndarray, Channels], noise) -> bool:
-    """Whether two answers, each by its times [s], differ by no more than the noise where both are."""
-    (t, mine), (u, theirs) = one, other
-    both = t <= min(t[-1], u[-1])
-    if not theirs or both.sum() < 0.9 * max(t.size, u.size):
-        return False
-    apart = {n: v[both] - np.interp(t[both], u, theirs[n]) for n, v in mine.items()}
-    return all(np.sqrt(np.mean(d**2)) <= noise[n] for n, d in apart.items())
+    first: list[Recording] = []
+    out = []
+    for log in recordings:
+        out.append(next((k for k, one in enumerate(first) if alike(log, one)), len(first)))
+        first += [log] if out[-1] == len(first) else []
+    return out

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.robust import robust_sd
-from simgap.robots.windows import FLIES, REGIMES, Window
+from hmmseg.robust import white_sd
+from simgap.robots.windows import REGIMES, Window
 from simgap.simulators.protocol import Channels, Simulator
 from simgap.simulators.recording import Recording
 
+FOLDS = 6  # numerics: parts that are held out in turn; each fit keeps five sixths
 RATE_LIMIT = 100.0  # chosen: Hz: residuals are means over neighbours down to this rate
 
 
@@ -36,11 +36,6 @@ class Rows:
     variance: np.ndarray
     of: tuple[slice, ...]
     _picks: tuple[_Pick, ...]
-
-    @property
-    def touching(self) -> np.ndarray:
-        """Whether each row's window has contacts (N,)."""
-        return self.regime != REGIMES.index(FLIES)
 
     def averaged(self, read: Sequence[Channels | None]) -> np.ndarray:
         """Rows (N,) of simulated channels by window; NaN where a rollout diverged."""
@@ -67,42 +62,45 @@ class _Pick:
 
 def rows_of(recordings: Sequence[Recording], windows: Sequence[Window], noise: Mapping[str, float]) -> Rows:
     """Rows of all windows. InputError where there is no sample at all."""
-    names = tuple(noise)
+    names, sd = tuple(noise), np.array([*noise.values()])
     picks, parts, of, at = [], [], [], 0
     for number, window in enumerate(windows):
         log = recordings[window.log].window(window.begin, window.end)
         span = max(float(log.t[-1] - log.t[0]), 1e-9)
         size = max(1, round(len(log) / max(span * RATE_LIMIT, 1.0)))
-        first = np.arange(0, len(log), size)
-        values = np.array([log[n] for n in names])
+        first, values = np.arange(0, len(log), size), np.array([log[n] for n in names])
         seen = np.isfinite(values)
-        count = np.add.reduceat(seen.astype(int), first, axis=1)
-        pick = _Pick(first, seen, count)
-        kept = (count > 0).T
+        pick = _Pick(first, seen, np.add.reduceat(seen.astype(int), first, axis=1))
         stamps = np.add.reduceat(log.t, first) / np.diff(np.append(first, len(log)))
-        group, channel = np.nonzero(kept)
-        variance = (np.array([noise[n] ** 2 for n in names])[:, None] / np.maximum(count, 1)).T[kept]
-        n = group.size
-        parts.append(
-            (
-                np.full(n, window.log),
-                channel,
-                np.full(n, number),
-                stamps[group],
-                stamps[group] - log.t[0],
-                pick.mean(values),
-                variance,
-            )
-        )
+        group, channel = np.nonzero(pick.count.T)
+        variance, n = sd[channel] ** 2 / pick.count[channel, group], group.size
+        of_window = np.full(n, window.log), channel, np.full(n, number), stamps[group]
+        parts.append((*of_window, stamps[group] - log.t[0], pick.mean(values), variance))
         picks.append(pick)
         of.append(slice(at, at + n))
         at += n
     if at == 0:
         raise InputError("recordings", "have no samples of the channels to compare", "numbers")
-    joined = [np.concatenate([p[i] for p in parts]) for i in range(7)]
-    log, channel, window, time, since, observed, variance = joined
+    log, channel, window, time, since, observed, variance = map(np.concatenate, zip(*parts, strict=True))
     regime = np.array([REGIMES.index(w.regime) for w in windows])[window]
     return Rows(names, log, channel, window, time, since, regime, observed, variance, tuple(of), tuple(picks))
+
+
+def folds_of(rows: Rows, num_logs: int, groups: Sequence[int] | None = None) -> np.ndarray:
+    """The fold (N,) of each row: logs, dealt out in turn; windows of one or two logs in stretches. With
+    `groups` (num_logs,), logs of one number are held out together."""
+    if groups is not None:
+        return np.unique(np.asarray(groups)[rows.log], return_inverse=True)[1]
+    if num_logs >= 3:
+        return rows.log % min(num_logs, FOLDS)
+    stretches = max(2, FOLDS // num_logs)
+    out = np.zeros(rows.log.size, int)
+    for log in range(num_logs):
+        mine = rows.log == log
+        window = rows.window[mine]
+        first, count = int(window.min()), int(np.ptp(window)) + 1
+        out[mine] = log * stretches + (window - first) * stretches // count
+    return np.unique(out, return_inverse=True)[1]
 
 
 # The noise of each channel: as stated or learned from differences, at least its resolution's.
@@ -124,20 +122,10 @@ def resolution(values: np.ndarray) -> float:
 
 
 def learned(recordings: Sequence[Recording], name: str) -> float:
-    """Standard deviation of white noise from differences, robustly, the least of those of ORDERS.
-
-    Of order n they have variance C(2n, n) sigma^2, the sum of squared binomials, and motion only adds to it:
-    a second difference holds gravity, a fourth no parabola.
-    """
-    return min(_by_difference(recordings, name, order) for order in ORDERS)
-
-
-def _by_difference(recordings: Sequence[Recording], name: str, order: int) -> float:
-    found = np.concatenate([np.diff(r[name], order) for r in recordings])
-    found = found[np.isfinite(found)]
-    if not found.size:
-        return 1.0
-    return float(robust_sd(found) / np.sqrt(comb(2 * order, order)))
+    """Standard deviation of white noise from differences, robustly, the least of those of ORDERS: motion only
+    adds to them. A second difference holds gravity, a fourth no parabola."""
+    values = np.concatenate([r[name][np.isfinite(r[name])] for r in recordings])
+    return min((white_sd(values, order) for order in ORDERS if values.size > order), default=1.0)
 
 
 def noises(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, float]:

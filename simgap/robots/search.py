@@ -20,6 +20,7 @@ from scipy.stats import t as student
 
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
+from simgap.robots.calibrate import Calibration
 from simgap.robots.fit import moved_to, prior_cost
 from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, wobbling
 from simgap.robots.model import Composed, Point
@@ -44,9 +45,7 @@ TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, what tells how far straight lines are off of what takes a cause's place
 LEADERS = 16  # numerics: candidates that are rolled out where they fit best
 USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
-LEAVES = (
-    2.0  # numerics: squares over the noise's; a set that leaves more may be better begun from the calibration
-)
+LEAVES = 2.0  # numerics: squares over the noise's, from which a search begins from the calibration, too
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
 JOINED = " against "
 NEAR = 10.0  # numerics: nats by which straight lines may be wrong of what takes a cause's place
@@ -95,12 +94,14 @@ class Settled:
 @dataclass
 class Search:
     """Sets of candidates along windows; `fold` (N,) of each row. `known`: sets that were fitted, each at its
-    best; `calibrated`: where calibration ended."""
+    best; `calibrated` fits what nobody measured, from the model as it comes, for where a search from there
+    leaves a gap; `calibration`: what it found."""
 
     composed: Composed
     wanted: Names
     fold: np.ndarray
-    calibrated: Callable[[], Point] = dict
+    calibrated: Callable[[], Calibration | None] = lambda: None
+    calibration: Calibration | None = None
     known: dict[frozenset[str], Settled] = field(default_factory=dict)
     starts: dict = field(default_factory=dict)
     against: dict[str, float] = field(default_factory=dict)
@@ -165,7 +166,8 @@ class Search:
     def _calibrated(self) -> Settled | None:
         """Of what calibration moved as much as is needed: taken back one by one where the whole acts, in
         closed form."""
-        calibrated = self.calibrated()
+        self.calibration = self.calibrated()
+        calibrated = {} if self.calibration is None else self.calibration.point
         moved = {n: v for n, v in calibrated.items() if n in self.wanted and self._off(n, v)}
         if not moved:
             return None
@@ -235,7 +237,7 @@ class Search:
 
     def _moved(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
         linear = linearise(composed, begin, [], self.starts)
-        return moved_to(composed, linear, whiten, begin).point
+        return moved_to(composed, linear, whiten, begin)
 
     def _judged(self, composed: Composed, names: Names, point: Point) -> Settled:
         linear = linearise(composed, point, [*self.along, *names], self.starts)
@@ -246,14 +248,8 @@ class Search:
         if wide := cov.off_alone(whiten, left):
             off = cov.learned(left, wide)
             whiten = cov.whitener(off, wide)
-        sets = Sets.of(
-            composed.effects,
-            linear,
-            [whiten],
-            [n for n in names if n in linear.moved],
-            self.fold,
-            self.log_odds,
-        )
+        usable = [n for n in names if n in linear.moved]
+        sets = Sets.of(composed.effects, linear, [whiten], usable, self.fold, self.log_odds)
         score = promise = -np.inf
         if not linear.diverged:
             white = whiten(left)
@@ -287,8 +283,7 @@ class Search:
                 more |= {} if one is None else {name: one}
         linear = linear.with_moved(more)
         cov = covariances(composed, linear)
-        scales = [Discrepancy({n: s * k for n, s in at.discrepancy.scale.items()}) for k in LEVELS]
-        scales = scales if at.discrepancy else []
+        scales = [{n: s * k for n, s in at.discrepancy.items()} for k in LEVELS if at.discrepancy]
         levels = [cov.whitener(d, at.wide) for d in (*scales, NONE)]
         usable = [n for n in names if n in linear.moved]
         sets = Sets.of(composed.effects, linear, levels, usable, self.fold, self.log_odds)

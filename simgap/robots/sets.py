@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -100,8 +101,7 @@ class Sets:
             gram.append([part.T @ part for part in parts])
             half.append(whiten.half_log_dets(np.searchsorted(numbers, fold)))
         size = tuple(len(effects[n].parameters) for n in names)
-        short = [(n, tuple(effects[n].parameters)) for n in names]
-        labels = tuple(n if len(own) == 1 else f"{n}.{s}" for n, own in short for s in own)
+        labels = tuple(effects[n].label(short) for n in names for short in effects[n].parameters)
         bounds = np.array(low), np.array(high)
         return cls(tuple(names), np.array(gram), np.array(half), width, size, labels, *bounds, log_odds)
 
@@ -146,9 +146,13 @@ class Sets:
     def product(self) -> tuple[list[str], np.ndarray]:
         """Candidates' parameters by name, and inner products (p, p) of their columns by the sensors'
         noise."""
-        first = 1 + self.along + np.concatenate([[0], np.cumsum([1 + k for k in self.size])]).astype(int)
-        at = [first[j] + 1 + k for j, size in enumerate(self.size) for k in range(size)]
+        at = [self.first[j] + 1 + k for j, size in enumerate(self.size) for k in range(size)]
         return list(self.labels), self.gram[-1].sum(0)[np.ix_(at, at)]
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        """The column of each candidate's constant."""
+        return 1 + self.along + np.cumsum([0, *(1 + k for k in self.size)])
 
     def _size(self, name: str) -> int:
         return self.size[self.names.index(name)]
@@ -160,8 +164,7 @@ class Sets:
         parameters."""
         used = np.arange(self.gram.shape[1]) != without
         gram, half = self.gram[level][used].sum(0), float(self.half_log_det[level][used].sum())
-        first = 1 + self.along + np.concatenate([[0], np.cumsum([1 + k for k in self.size])]).astype(int)
-        place = {n: first[j] for j, n in enumerate(self.names)}
+        place = {n: self.first[j] for j, n in enumerate(self.names)}
         ordered = [s if kept else tuple(sorted(s, key=self._size)) for s in sets]
         free = np.array([
             [*range(1, 1 + self.along), *(place[n] + 1 + k for n in s for k in range(self._size(n)))]
@@ -261,9 +264,8 @@ def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
 def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str, str, float]]:
     """Pairs of a read-out's and a command's effect, of one parameter each, whose columns nearly cancel, and
     how much of the second, in usual sizes, goes against one of the first."""
-    first = 1 + sets.along + np.concatenate([[0], np.cumsum([1 + k for k in sets.size])]).astype(int)
     single = [j for j, k in enumerate(sets.size) if k == 1]
-    at = np.array([first[j] + 1 for j in single], int)
+    at = np.array([sets.first[j] + 1 for j in single], int)
     product = sets.gram[-1].sum(0)[np.ix_(at, at)]
     length = np.sqrt(np.diag(product))
     seen = length > SEEN

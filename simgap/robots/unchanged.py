@@ -10,29 +10,28 @@ number of rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.robust import robust_sd
-from simgap.robots.calibrate import Calibration
+from simgap.robots.calibrate import Calibration, without_starts
+from simgap.robots.fit import Cost, Local, descended
 from simgap.robots.linear import base_at, linearise, vary
-from simgap.robots.model import Composed, Point
+from simgap.robots.model import Composed, Point, motions
 from simgap.robots.rows import resolution
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
 BROKEN = 10.0  # chosen: of what 5 % of samples leave the mean of their neighbours by, a sample that is broken
 TAILS = 4.0  # cited: degrees of freedom of what a model leaves, as Lange et al. fix them
-ALIKE = 0.1  # chosen: of a command's usual size; logs whose commands are closer than this are of one motion
 UNITS = 4  # numerics: motions, below which each is cut into stretches
 POSITIVE = 0.3  # numerics: of its sd, above which a parameter that cannot be negative is varied by factors
 STEP = 0.02  # numerics: of a finite difference
-STEPS, FAR = 10, 1.0  # numerics: of a fit, and how far each goes at most, in coordinates
-GAINED = 1e-3  # numerics: of a fit's cost, what a step must gain for it to go on
-WIDER = (8.0, 4.0, 2.0, 1.0)  # numerics: scales of tails, first wider than they are
+FAR = 1.0  # numerics: coordinates: how far a step of a fit goes at most
+ROUNDS = 2  # numerics: fits to OLD, each with the scales and the dependence that the last one left
 
 
 @dataclass(frozen=True)
@@ -113,30 +112,6 @@ class Coordinates:
         return out
 
 
-Motion = list[tuple[np.ndarray, np.ndarray, float]]  # by command times [s], values, and their usual size
-
-
-def motions_of(composed: Composed) -> list[Motion]:
-    """What every log's commands are."""
-    logs, known = composed.recordings, composed.simulator.channels
-    out: list[Motion] = [[] for _ in logs]
-    for name in (n for n, c in known.items() if c.kind == "command"):
-        every = np.concatenate([log[name] for log in logs])
-        size = float(np.std(every) + abs(np.mean(every)))
-        for mine, log in zip(out, logs, strict=True):
-            mine.append((log.t - log.t[0], log[name], max(size, 1e-300)))
-    return out
-
-
-def of_one_motion(one: Motion, other: Motion) -> bool:
-    """Whether commands are alike: logs of one motion share what a model gets wrong."""
-    far = []
-    for (t, a, size), (u, b, _) in zip(one, other, strict=True):
-        both = t <= min(t[-1], u[-1])
-        far.append(float(np.sqrt(np.mean((a[both] - np.interp(t[both], u, b)) ** 2))) / size)
-    return bool(far) and max(far) < ALIKE
-
-
 class Runs:
     """Logs run freely about a model: standardised rows, their derivatives, and how units of logs tell of
     parameters.
@@ -156,15 +131,9 @@ class Runs:
         self.scaled(self._scales() if scale is None else scale)
 
     def scaled(self, scale: np.ndarray) -> None:
-        """Use these scales by channel (C,); starts are taken out in their units."""
-        rows, starts = self.composed.rows, self.linear.starts
-        self.scale, self.parts = scale, []
-        for window, mine in zip(self.composed.windows, rows.of, strict=True):
-            doubt = [starts[state][mine] * sd for state, sd in window.doubt.items()]
-            if doubt:
-                away = np.array(doubt).T / scale[rows.channel[mine], None]
-                left, value, _ = np.linalg.svd(away, full_matrices=False)
-                self.parts.append((mine, left, value**2 / (1 + value**2)))
+        """Use these scales by channel (C,); starts are taken off in their units."""
+        self.scale = scale
+        self.standard = without_starts(self.composed, self.linear, scale[self.composed.rows.channel])
 
     def _scales(self, values: np.ndarray | None = None) -> np.ndarray:
         """Student's scale of every channel (C,), by expectation and maximisation."""
@@ -180,18 +149,9 @@ class Runs:
             out[c] = np.sqrt(s2)
         return out
 
-    def rescaled(self, point: Point, wider: float = 1.0) -> None:
-        """Learn scales from what the model leaves at a point, and take so many times as wide ones."""
-        left = self.rows(point)
-        self.scaled(wider * self._scales(left * self.scale[self.composed.rows.channel]))
-
-    def standard(self, values: np.ndarray) -> np.ndarray:
-        """Rows (N,) or columns (N, c) in units of their scale, starts taken out."""
-        size = self.scale[self.composed.rows.channel]
-        out = values / (size if values.ndim == 1 else size[:, None])
-        for rows, left, less in self.parts:
-            out[rows] -= left @ ((left.T @ out[rows]).T * less).T
-        return out
+    def rescaled(self, point: Point) -> None:
+        """Learn scales from what the model leaves at a point."""
+        self.scaled(self._scales(self.rows(point) * self.scale[self.composed.rows.channel]))
 
     def rows(self, point: Point) -> np.ndarray:
         """Recorded less simulated, standardised (N,); not finite where a run diverged."""
@@ -240,34 +200,7 @@ def loss(rows: np.ndarray) -> np.ndarray:
     return (TAILS + 1) / 2 * np.log1p(rows**2 / TAILS)
 
 
-Local = tuple[np.ndarray, np.ndarray]  # information (q, q) and pull (q,)
-
-
-def descended(
-    cost: Callable[[np.ndarray], float], local: Callable[[np.ndarray], Local], x: np.ndarray
-) -> np.ndarray:
-    """Where a cost is least, from x, by Levenberg's and Marquardt's steps."""
-    now, damping = cost(x), 0.0
-    for _ in range(STEPS if x.size else 0):
-        if not np.isfinite(now):
-            break
-        bend, pull = local(x)
-        for _ in range(6):
-            move = np.linalg.solve(bend + np.diag(damping * np.diag(bend) + 1e-9), pull)
-            there = cost(x + np.clip(move, -FAR, FAR))
-            if there < now:
-                break
-            damping = max(10 * damping, 0.01)
-        else:
-            break
-        x, gained, now = x + np.clip(move, -FAR, FAR), now - there, there
-        damping /= 10
-        if gained < GAINED * now:
-            break
-    return x
-
-
-def halved(cost: Callable[[np.ndarray], float], x: np.ndarray, step: np.ndarray) -> np.ndarray:
+def halved(cost: Cost, x: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Where a step leads that straight lines took too far: it is halved until it costs least."""
     tried = [x + part * np.clip(step, -FAR, FAR) for part in (1.0, 0.5, 0.25, 0.125)]
     return min(tried, key=cost)
@@ -291,73 +224,68 @@ class Old:
     missed: np.ndarray
     scale: np.ndarray
 
-
-def _objective(
-    runs: Runs, theta: Coordinates, point: Point, nominal: np.ndarray, sd: np.ndarray, dependence: float
-) -> tuple[Callable[[np.ndarray], float], Callable[[np.ndarray], Local]]:
-    """What OLD's fit makes least, of coordinates z (p,), and its curvature and pull there; the prior counts
-    `dependence` times, as rows do not count singly."""
-
-    def cost(z: np.ndarray) -> float:
-        off, rows = (theta.values(z) - nominal) / sd, runs.rows(theta.point(point, z))
-        whole = float(loss(rows).sum() + 0.5 * dependence * off @ off)
-        return whole if np.isfinite(rows).all() else np.inf
-
-    def local(z: np.ndarray) -> Local:
-        there, slope = theta.point(point, z), theta.slopes(z) / sd
-        bend, pull = runs.told(runs.rows(there), runs.slopes(there, theta, z))
-        push = dependence * slope * (theta.values(z) - nominal) / sd
-        return bend.sum(0) + dependence * np.diag(slope**2), pull.sum(0) - push
-
-    return cost, local
+    @property
+    def bend(self) -> np.ndarray:
+        """The curvature (p, p) of what OLD and the prior say of theta."""
+        return self.information.sum(0) + self.prior
 
 
 def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarray) -> Old:
-    """What OLD logs tell of a robot that does not change, from the point of its calibration."""
+    """What OLD logs tell of a robot that does not change, from the point of its calibration. The prior counts
+    `dependence` times, as rows do not count singly."""
     point: Point = {} if calibration is None else {n: dict(v) for n, v in calibration.point.items()}
     fitted = [e for e in point if not composed.numeric(e)]
     runs = Runs(composed, point, unit)
     known = [composed.effects[e].parameters[s] for e in fitted for s in composed.effects[e].parameters]
     nominal, sd = np.array([q.nominal for q in known]), np.array([q.sd for q in known])
     p, m, dependence = len(known), len(runs.units), 1.0
-    for wider in WIDER if p else (1.0,):  # so that a log that is far off is not taken for a tail of others
-        runs.rescaled(point, wider)
-        theta = Coordinates.of(composed, point, fitted)
 
-        found = descended(*_objective(runs, theta, point, nominal, sd, dependence), np.zeros(p))
-        point = theta.point(point, found)
+    def prior(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        """Minus its log at coordinates, its curvature (p, p) and pull (p,)."""
+        off, slope = (theta.values(z) - nominal) / sd, theta.slopes(z) / sd
+        return 0.5 * dependence * float(off @ off), dependence * np.diag(slope**2), -dependence * slope * off
+
+    def cost(z: np.ndarray) -> float:
+        rows = runs.rows(theta.point(point, z))
+        return float(loss(rows).sum()) + prior(z)[0] if np.isfinite(rows).all() else np.inf
+
+    def told(z: np.ndarray) -> Local:  # by unit
+        there = theta.point(point, z)
+        return runs.told(runs.rows(there), runs.slopes(there, theta, z))
+
+    def local(z: np.ndarray) -> Local:
+        (information, pull), (_, bend, push) = told(z), prior(z)
+        return information.sum(0) + bend, pull.sum(0) + push
+
+    none = np.zeros(p)
+    for _ in range(ROUNDS):
         runs.rescaled(point)
-        theta, z = Coordinates.of(composed, point, fitted), np.zeros(p)
-        information, pull = runs.told(runs.rows(point), runs.slopes(point, theta, z))
-        slope = theta.slopes(z) / sd
+        theta = Coordinates.of(composed, point, fitted)
+        point = theta.point(point, descended(cost, local, none, far=FAR))
+        runs.rescaled(point)
+        theta = Coordinates.of(composed, point, fitted)
+        information, pull = told(none)
         if p and m > 1:  # as if every row were so many
-            spread = np.linalg.solve(information.sum(0) + dependence * np.diag(slope**2), pull.T @ pull)
+            spread = np.linalg.solve(information.sum(0) + prior(none)[1], pull.T @ pull)
             dependence = max(1.0, float(np.trace(spread)) * m / (m - 1) / p)
-    prior = dependence * np.diag(slope**2) + 1e-9 * np.eye(p)
-    total, missed = information.sum(0) + prior, np.zeros(m)
-    rest = pull.sum(0) - dependence * slope * (theta.values(np.zeros(p)) - nominal) / sd
+    _, bend, push = prior(none)
+    bend, missed = bend + 1e-9 * np.eye(p), np.zeros(m)
     for u in range(m):
 
-        def without(z: np.ndarray, u=u) -> tuple[float, float]:
-            kept, out = runs.losses(theta.point(point, z), u)
-            return kept + 0.5 * dependence * float(np.sum(((theta.values(z) - nominal) / sd) ** 2)), out
+        def without(z: np.ndarray, u=u) -> float:
+            return runs.losses(theta.point(point, z), u)[0] + prior(z)[0]
 
-        step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
-        missed[u] = without(halved(lambda z, f=without: f(z)[0], np.zeros(p), step))[1]
-    every = information, pull, prior, dependence, missed, runs.scale
-    return Old(point, theta, runs.units, *every)
+        less = information.sum(0) - information[u] + bend
+        step = np.linalg.lstsq(less, pull.sum(0) - pull[u] + push, rcond=None)[0]
+        missed[u] = runs.losses(theta.point(point, halved(without, none, step)), u)[1]
+    return Old(point, theta, runs.units, information, pull, bend, dependence, missed, runs.scale)
 
 
 def units_of(old: Composed, new: Composed) -> tuple[np.ndarray, np.ndarray]:
     """The unit of every row of OLD and of NEW: the motion, or where NEW makes few, which OLD makes too, a
     stretch of it; what a model gets wrong all along a motion that OLD never made says the same in each."""
-    first: list[Motion] = []
-    number: list[list[int]] = [[], []]
-    for mine, motions in zip(number, (motions_of(old), motions_of(new)), strict=True):
-        for motion in motions:
-            same = next((k for k, one in enumerate(first) if of_one_motion(motion, one)), len(first))
-            first += [motion] if same == len(first) else []
-            mine.append(same)
+    every = motions(old.simulator, [*old.recordings, *new.recordings])
+    number = every[: len(old.recordings)], every[len(old.recordings) :]
     few = len(set(number[1]))
     pieces = -(-UNITS // few) if set(number[1]) <= set(number[0]) else 1
     out = []

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -194,21 +195,16 @@ def _where(search: Search, one: Settled, phases: Phases) -> tuple[Cell, ...]:
     return significant(mine, band, left[:, 0], np.ones(white.size))
 
 
-@dataclass(frozen=True)
-class NextLog:
-    """A log whose motion is to be repeated, the effects it separates, and what it is expected to gain."""
-
-    log: str
-    separates: tuple[str, ...]
-    gain: float
+def repeated(log: str, separates: Sequence[str], gain: float) -> dict[str, Any] | None:
+    """The next experiment, as the document has it: a log whose motion is to be repeated, the effects that it
+    separates, and what it is expected to gain [nats]; None where that is less than one."""
+    known = {"do": f"repeat the motion of {log}", "log": log, "separates": list(separates)}
+    return known | {"expected_gain_nats": gain} if gain > 1.0 else None
 
 
-def next_log(search: Search, best: Settled, verdict: RobotVerdict) -> NextLog | None:
+def next_log(search: Search, best: Settled, verdict: RobotVerdict) -> dict[str, Any] | None:
     """For a set: of the sets that were fitted with one of its members each, the log along which the closest
-    two differ most, whitened.
-
-    None where nothing is to be separated, or no motion is expected to gain a nat.
-    """
+    two differ most, whitened."""
     if verdict.verdict != "set":
         return None
     logs = search.composed.recordings
@@ -221,6 +217,4 @@ def next_log(search: Search, best: Settled, verdict: RobotVerdict) -> NextLog | 
         if each.sum() < smallest:
             smallest, gains = float(each.sum()), each
     at = int(gains.argmax())
-    if gains[at] < 1.0:
-        return None
-    return NextLog(logs[at].name, (*verdict.causes, *verdict.indistinguishable), float(gains[at]))
+    return repeated(logs[at].name, (*verdict.causes, *verdict.indistinguishable), float(gains[at]))

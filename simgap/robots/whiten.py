@@ -51,17 +51,8 @@ WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
 CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
 
 
-@dataclass(frozen=True)
-class Discrepancy:
-    """`scale`: s by channel [unit / s^2, unit / s or unit]."""
-
-    scale: Mapping[str, float]
-
-    def __bool__(self) -> bool:
-        return bool(self.scale)
-
-
-NONE = Discrepancy({})
+Discrepancy = dict[str, float]  # s by source, of a channel [unit / s^2, unit / s or unit]
+NONE = Discrepancy()
 
 
 @dataclass(frozen=True)
@@ -74,16 +65,8 @@ class Source:
 
     def add(self, total: np.ndarray, variance: float) -> None:
         """Add it to a block's covariance, in place."""
-        total[self._where] += variance * self.covariance
-
-    @property
-    def _where(self) -> tuple:
-        if self.covariance.ndim == 1:
-            return self.rows, self.rows
-        first, end = int(self.rows[0]), int(self.rows[-1]) + 1
-        if end - first == self.rows.size:  # rows ascend: a part of the matrix, which needs no copy
-            return slice(first, end), slice(first, end)
-        return self.rows[:, None], self.rows
+        across = self.rows if self.covariance.ndim == 1 else self.rows[:, None]
+        total[across, self.rows] += variance * self.covariance
 
 
 @dataclass(frozen=True)
@@ -106,7 +89,7 @@ class Block:
     def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
         """The rows' covariance (n, n)."""
         out = np.diag(self.variance) + self.start @ self.start.T
-        for name, s in discrepancy.scale.items():
+        for name, s in discrepancy.items():
             if name in self.sources:
                 self.sources[name].add(out, s**2)
         return out
@@ -184,9 +167,7 @@ class Covariances:
             ]
             least = int(np.argmin(without))
             if plain - done.fun >= WORTH and without[least] >= WORTH:
-                return Discrepancy(
-                    {names[k]: float(np.exp(v / 2)) for k, v in zip(kept, done.x, strict=True)}
-                )
+                return {names[k]: float(np.exp(v / 2)) for k, v in zip(kept, done.x, strict=True)}
             kept, x = kept[:least] + kept[least + 1 :], np.delete(done.x, least)
         return NONE
 
@@ -230,7 +211,7 @@ def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float
     the log determinant of N + G K, what differs between them that of N.
     """
     again = block.repeats if discrepancy else 1
-    shared = Discrepancy({n: s * again**0.5 for n, s in discrepancy.scale.items()})
+    shared = {n: s * again**0.5 for n, s in discrepancy.items()}
     factor = _factored(block.covariance(shared))
     half = float(np.log(np.diag(factor)).sum())
     if again == 1:

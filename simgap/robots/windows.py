@@ -25,7 +25,6 @@ NEIGHBOURS = 5  # numerics: samples
 DEGREES = (2, 3, 4)  # numerics: of polynomials through them
 # chosen: a start's error over what noise alone makes it: the window's own samples settle the rest
 DOUBT = 3.0
-FREE = "free"  # what a simulator's `contact_states` call the state in which nothing touches
 STILL = 0.01  # chosen: share of a channel's range; a stretch in which none goes further is still
 AT_REST, CALM = 0.002, 0.05  # chosen: likewise, and s: what touches and goes no further in this time rests
 JUMPS = "command jumps"  # beside the states of a start: when in its interval a command jumped
@@ -155,7 +154,7 @@ def _touching(simulator: Simulator, log: Recording) -> np.ndarray:
         return np.zeros(len(log), bool)
     times, what = states(log)
     latest = np.searchsorted(times, log.t, side="right") - 1
-    return np.array([label != FREE for label in what])[np.maximum(latest, 0)]
+    return np.array([bool(pairs) for pairs in what])[np.maximum(latest, 0)]
 
 
 def _readable(simulator: Simulator, log: Recording, end: int) -> int:

@@ -12,7 +12,16 @@ from experiments.real.servo import Servo
 from hmmseg.errors import InputError
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.changes import Changes, Comparison, _unlike, added_by_drift, by_chance, changes, jackknife
+from simgap.robots.changes import (
+    Changes,
+    Comparison,
+    Hypothesis,
+    _unlike,
+    added_by_drift,
+    by_chance,
+    changes,
+    jackknife,
+)
 from simgap.robots.unchanged import without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
@@ -186,10 +195,11 @@ def test_an_explanations_energy_is_minus_the_log_of_its_evidence():
     every = effects_of(SIMULATOR, logs(0))
     found = changes(SIMULATOR, logs(0), logs(100, gain=3.5), {"gain": replace(every["gain"], fitted=False)})
     one = next(c for c in found.tried if c.effects == ("gain",))
-    made = Comparison(found.composed, found.old, [], found.runs.unit)
-    at = made._coordinates(("gain",))
+    of = Hypothesis.about(
+        Comparison(found.composed, found.old, [], found.runs.unit).runs, found.old, ("gain",)
+    )
     x = one.x[0] + np.linspace(-0.1, 0.1, 401)
-    costs = np.array([made.cost(np.array([v]), *at) for v in x]) / found.old.dependence
+    costs = np.array([of.cost(np.array([v])) for v in x]) / found.old.dependence
     evidence = logsumexp(-costs - np.log(np.pi * (1 + x**2))) + np.log(x[1] - x[0])
     assert one.energy == pytest.approx(-evidence, abs=0.1)
     assert found.p_value < 1e-6

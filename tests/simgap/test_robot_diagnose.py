@@ -7,8 +7,7 @@ from simgap_swing import Swing, log
 from hmmseg.errors import InputError
 from simgap.robots.describe import body
 from simgap.robots.diagnose import diagnose
-from simgap.robots.heldout import folds_of
-from simgap.robots.rows import Rows
+from simgap.robots.rows import Rows, folds_of
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 

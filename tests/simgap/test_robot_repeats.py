@@ -8,7 +8,7 @@ import pytest
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
 from simgap.robots.linear import linearise
-from simgap.robots.model import Composed, motions
+from simgap.robots.model import Composed
 from simgap.robots.sets import Sets
 from simgap.robots.whiten import TAU, Discrepancy, covariances
 from simgap.simulators.recording import Recording
@@ -40,8 +40,7 @@ def composed(errors: np.ndarray, rng: np.random.Generator, paces=None) -> Compos
         y = simulator.simulate({"size": 1.0}, bare)["y"] + error + NOISE * rng.standard_normal(T.size)
         logs.append(bare.with_columns({"y": y}))
     effects = {n: e for n, e in candidates(Setting(simulator, logs)).items() if n == "size" or e.fitted}
-    made = Composed.of(simulator, logs, effects, {"y": NOISE})
-    return replace(made, motion=motions(made))
+    return Composed.of(simulator, logs, effects, {"y": NOISE})
 
 
 def misses(seed: int, shared: bool, repeats: bool) -> float:
@@ -65,7 +64,7 @@ def test_what_repeats_share_makes_an_interval_as_wide_as_one_log_would(repeats: 
     assert (0.8 < scatter < 1.2) if repeats else scatter > 2
 
 
-def test_logs_are_repeats_where_the_simulator_answers_alike():
+def test_logs_are_repeats_where_their_commands_are_alike():
     rng = np.random.default_rng(0)
     still = np.zeros((LOGS, T.size))
     made = composed(still, rng, [1.0, 1.0, 2.0, 1.0, 2.0, 1.0005, 3.0, 1.0])

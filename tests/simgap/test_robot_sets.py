@@ -92,7 +92,7 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
     root = [np.linalg.cholesky(b.covariance(true)) for b in cov.blocks]
     rows = np.concatenate([each @ rng.standard_normal(80) for each in root])
     found = cov.learned(rows)
-    assert {*found.scale} == {"p"} and found.scale["p"] == pytest.approx(0.7, rel=0.2)
+    assert {*found} == {"p"} and found["p"] == pytest.approx(0.7, rel=0.2)
     white = cov.whitener(found)(rows)
     assert np.mean(white**2) == pytest.approx(1.0, rel=0.1)
     assert cov.off_alone(cov.whitener(found), rows) == {}

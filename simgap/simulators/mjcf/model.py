@@ -17,7 +17,7 @@ from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
-from simgap.simulators.mjcf.setting import HOLD, LATE, Setting, changed_model, name_of, object_id
+from simgap.simulators.mjcf.setting import HOLD, LATE, Setting, changed_model, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
@@ -190,18 +190,25 @@ class MjcfSimulator:
         times, what = self.contact_states(recording)
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
-    def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[str]]:
-        """What touches along the recorded motion: times, and at each `free` or the touching bodies."""
-        rows = self._shown(recording)
-        sets = self.touched(recording) if self.touching else [frozenset()] * rows.size
-        return recording.t[rows], contact_labels(self.model, recording.t[rows], sets)
+    def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[Pairs]]:
+        """Times along the recorded motion, and at each the pairs of bodies that touch.
+
+        A contact begins and ends between samples: those on either side count too.
+        """
+        t, none = recording.t[self._shown(recording)], frozenset[tuple[int, int]]()
+        if not self.touching:
+            return t, [none] * t.size
+        body = self.model.geom_bodyid
+        sets = [frozenset((int(body[a]), int(body[b])) for a, b in one) for one in self.touched(recording)]
+        wide = [a | b | c for a, b, c in zip([none, *sets], sets, [*sets[1:], none], strict=False)]
+        return t, closed(t, wide)
 
     def _shown(self, recording: Recording) -> np.ndarray:
         """Samples at which contacts are looked at: 200 a second at most."""
         span = float(recording.t[-1] - recording.t[0])
         return np.arange(0, len(recording), max(1, round(len(recording) / max(span * 200, 1.0))))
 
-    def touched(self, recording: Recording) -> list[frozenset[tuple[int, int]]]:
+    def touched(self, recording: Recording) -> list[Pairs]:
         """Pairs of geoms that touch along the recorded motion, at the samples looked at."""
         states = (*self.joints, *(m[a] for m in self.free.values() for a in POSE))
         at = [q for q, _ in self._places.values()]
@@ -210,7 +217,7 @@ class MjcfSimulator:
         rows = self._shown(recording)
         poses = np.array([bridged(recording[c])[rows] for c in states]).reshape(-1, rows.size).T
 
-        def made() -> list[frozenset[tuple[int, int]]]:
+        def made() -> list[Pairs]:
             data = self._data[0]
             mujoco.mj_setState(self.model, data, self._reset(), FULL)
             return touching_pairs(self.model, data, poses, at)
@@ -222,25 +229,10 @@ def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | N
     return None if a is None or b is None else {n: a[n] + share * (b[n] - a[n]) for n in a}
 
 
-# What touches what along a recorded motion, in words.
-
 # chosen: s: a contact that is there again sooner was never lost: sensors' noise breaks it
 BROKEN = 0.04
-FREE = "free"
-GROUND = "ground"  # a geom of the world without a name
 
 Pairs = frozenset[tuple[int, int]]
-
-
-def contact_labels(model: Any, t: np.ndarray, touched: Sequence[Pairs]) -> list[str]:
-    """At times t `free`, or which bodies touch, such as `cube on board`.
-
-    A contact begins and ends between samples: those on either side count too.
-    """
-    sets = [frozenset(_pair(model, a, b) for a, b in pairs) for pairs in touched]
-    none: frozenset[str] = frozenset()
-    wide = [a | b | c for a, b, c in zip([none, *sets], sets, [*sets[1:], none], strict=False)]
-    return [", ".join(sorted(s)) or FREE for s in closed(t, wide)]
 
 
 def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
@@ -255,21 +247,7 @@ def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
     return out
 
 
-def _pair(model: Any, *geoms: int) -> str:
-    """What moves, on what it touches: names of geoms' bodies, then those of the world's geoms."""
-    named = []
-    for geom in geoms:
-        body = int(model.geom_bodyid[geom])
-        own = (
-            name_of(model, "body", body) or f"body {body}" if body else name_of(model, "geom", geom) or GROUND
-        )
-        named.append((body == 0, own))
-    return " on ".join(name for _, name in sorted(named))
-
-
-def touching_pairs(
-    model: Any, data: Any, poses: np.ndarray, at: Sequence[int]
-) -> list[frozenset[tuple[int, int]]]:
+def touching_pairs(model: Any, data: Any, poses: np.ndarray, at: Sequence[int]) -> list[Pairs]:
     """Pairs of geoms that touch in each pose (n, k), whose coordinates are `at` these of the model's."""
     out, none = [], frozenset()
     for pose in poses:

@@ -89,19 +89,6 @@ def free_run(model: Any, data: Any, log: Recording, first: np.ndarray, driven: M
     return states[np.clip(np.searchsorted(times, since) - 1, 0, times.size - 1)]
 
 
-@dataclass(frozen=True)
-class Side:
-    """Windows of as many samples, side by side: how their commands are held and their sensors read."""
-
-    held: Held
-    between: Between
-
-    @classmethod
-    def of(cls, since: np.ndarray, times: np.ndarray) -> Side:
-        """Of windows whose samples are at `since` (B, n) [s] of their begin."""
-        return cls(Held(since, times), Between(since, times))
-
-
 def body_rate(quat: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Angular velocity (3,) in the body's frame, 2 conj(q) dq/dt, of a unit quaternion, scalar first."""
     w, x, y, z = quat
@@ -170,8 +157,8 @@ class Runs:
         sides = [self._side(own, times) for _, own in parts]
         control = np.zeros((len(logs), times.size, self.model.nu))
         line, late = (dict(changed).get(name, 0.0) for name in (HOLD, LATE))
-        for (mine, own), side in zip(parts, sides, strict=True):
-            held = _carried_out(own, side.held, late * h)
+        for (mine, own), (plain, _) in zip(parts, sides, strict=True):
+            held = _carried_out(own, plain, late * h)
             for column, place in self.driven.items():
                 control[mine, :, place] = held(np.array([_commanded(log, column) for log in own]), line)
         sensed = self._sensed(first, control, changed)
@@ -198,24 +185,25 @@ class Runs:
         size = 8 * len(first) * control.shape[1] * max(self.model.nsensordata, 1)
         return latest(self._ran, key, run, int(KEPT / size))
 
-    def _side(self, logs: Sequence[Recording], times: np.ndarray) -> Side:
-        """How windows of one length lie on the steps."""
+    def _side(self, logs: Sequence[Recording], times: np.ndarray) -> tuple[Held, Between]:
+        """How windows of as many samples lie on the steps: how their commands are held and sensors read."""
         since = np.array([log.t - log.t[0] for log in logs])
         key = (since.shape, since.tobytes(), times.size, float(times[1]))
-        return latest(self._sides, key, lambda: Side.of(since, times))
+        return latest(self._sides, key, lambda: (Held(since, times), Between(since, times)))
 
     def _read(
-        self, logs: Sequence[Recording], sensed: np.ndarray, side: Side, times: np.ndarray
+        self, logs: Sequence[Recording], sensed: np.ndarray, side: tuple[Held, Between], times: np.ndarray
     ) -> list[Channels | None]:
         """Sensors (B, steps, sensors) at the logs' times: between steps by cubics where they are smooth."""
         smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
-        between = side.between(sensed[:, :, [self.sensor[n] for n in smooth]])
+        held, between = side
+        read = between(sensed[:, :, [self.sensor[n] for n in smooth]])
         whole: list[Channels | None] = []
         for b, log in enumerate(logs):
-            out = {n: between[b, :, k] for k, n in enumerate(smooth)}
+            out = {n: read[b, :, k] for k, n in enumerate(smooth)}
             for name, address in self.sensor.items():
                 if name not in out:
-                    out[name] = np.interp(side.held.since[b], times, sensed[b, :, address])
+                    out[name] = np.interp(held.since[b], times, sensed[b, :, address])
             for columns in self.free.values():
                 aligned(log, out, columns)
             whole.append(out if all(np.abs(v).max() < FAR for v in out.values()) else None)
