@@ -36,6 +36,13 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.segmentation.align import align
 
 ARM = Path("../shared/panda")
+ARM_RIG = parse_rig({
+    "gravity": 9.81,
+    "gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width",
+                "wrench": ["Fx", "Fy", "Fz"]},
+    "columns": {"width": {"offset": -1.02e-3}},  # between the pads, as its own two-finger files have it
+    "fingertip": {"normal_stiffness": 3735.0, "shear_stiffness": 2500.0},
+})  # fmt: skip
 # The wrench of the arm with the offset of a sensor that was never tared, N.
 FRESH = 1000  # first seed: none that anything was made with
 UNTARED = {"Fx": 3.0, "Fy": -2.0, "Fz": 7.0}
@@ -79,17 +86,10 @@ def score(recordings: Sequence, rig: Rig, task: BlockTask, truths: Sequence, blo
 def arm(folder: Path) -> dict[str, dict]:
     """The arm's four trials: from the wrist, tared or not, and as two fingers made up from it."""
     cases = {}
-    own = parse_rig({
-        "gravity": 9.81,
-        "gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width",
-                    "wrench": ["Fx", "Fy", "Fz"]},
-        "columns": {"width": {"offset": -1.02e-3}},  # between the pads, as its own two-finger files have it
-        "fingertip": {"normal_stiffness": 3735.0, "shear_stiffness": 2500.0},
-    })  # fmt: skip
     source = folder / "wrist_restack_1"
     files = sorted(source.glob("wrist_*.csv"))
-    cases["wrist"] = _arm_case(files, own, source)
-    cases["wrist, untared"] = _arm_case([_offset(file) for file in files], own, source)
+    cases["wrist"] = _arm_case(files, ARM_RIG, source)
+    cases["wrist, untared"] = _arm_case([_offset(file) for file in files], ARM_RIG, source)
     for name in ("wrist_restack_1", "wrist_untared"):
         source = folder / name
         label = "made-up fingers" + ", untared" * (name == "wrist_untared")

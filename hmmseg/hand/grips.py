@@ -130,7 +130,10 @@ def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
 def _fastest(t: np.ndarray, opening: np.ndarray, begun: int, first: int, held: float) -> float:
     """Opening [m] at which a closing is fastest: what is touched later is narrower."""
     way = _coarse(t, opening, begun, first + 1)
-    return max(float(way[np.argmin(np.diff(way))] if way.size > 1 else opening[begun]), held)
+    if way.size < 2:
+        return max(float(opening[begun]), held)
+    at = int(np.argmin(np.diff(way)))
+    return max(float(way[at] + way[at + 1]) / 2, held)
 
 
 def _release(t: np.ndarray, opening: np.ndarray, last: int, held: float) -> tuple[float, float] | None:

@@ -145,20 +145,24 @@ def judged(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
 
 def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
     """Positions in mm or cm (no hand travels so far), or far too small."""
+    gripper = None if rig is None else rig.gripper
+    names = ("x1", "y1", "x2", "y2") if gripper is None else gripper.position.values()
     travels = {
         name: float(np.nanmax(values) - np.nanmin(values))
         for name, values in trial.channels.items()
-        if name in ("x1", "y1", "x2", "y2") and np.isfinite(values).any()
+        if name in names and np.isfinite(values).any()
     }  # fmt: skip
     far = {name: travel for name, travel in travels.items() if travel > REACH}
     if far:
         name, travel = max(far.items(), key=lambda item: item[1])
         unit, text = length_unit(travel)
         problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {text}"
-        return [Finding(name, problem, all_changed(far, rig, unit=unit))]
+        mended = far if gripper is None else travels  # one sensor has one unit
+        return [Finding(name, problem, all_changed(mended, rig, unit=unit))]
     if travels and max(travels.values()) < STILL:
+        name = next(iter(travels))
         problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were in km"
-        return [Finding("x1", problem, all_changed(travels, rig, unit="mm"), certain=False)]
+        return [Finding(name, problem, all_changed(travels, rig, unit="mm"), certain=False)]
     return []
 
 

@@ -93,7 +93,7 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
         felt = all(np.mean(np.isnan(force)) < SPARSE for force in forces)  # often enough to judge sides by
         looks += [check_noise, check_axes, check_signs] if felt else [check_noise]
     if rig.gripper is not None:
-        looks = [check_clock, check_gripper]
+        looks = [check_clock, check_lengths, check_gripper]
     for look in looks:
         for finding in look(trial, rig):
             mapped = "topics" if any(name in rig.topics for name in finding.changes) else "columns"

@@ -1,7 +1,7 @@
 """Which readings of a hand are none: what a working sensor cannot have read is named and left out.
 
 This follows from a model of a sensor. Its readings scatter, so that neighbours repeat each other to the
-last digit as often as the channel's resolution and its fellows (the other forces, the other joints) allow;
+last digit as often as elsewhere in the channel and its fellows (the other forces, the other joints);
 they stay within a few times the range of all others; a position moves no farther between two samples than its
 velocity carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of
 missing readings is a fault where its length has next to no chance under that model, so that coarse sensors,
@@ -253,28 +253,20 @@ def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) 
 
 def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
                       fellows: list[str], stated: float | None) -> float:  # fmt: skip
-    """How likely a reading repeats the one before: by the channel's resolution and noise, and its fellows'.
+    """How likely a reading repeats the one before: as often as others of the channel and its fellows do.
 
-    What the channel reads besides `value` counts, or where it reads nothing else, what its fellows do. 1
-    where readings do not scatter, as far as they and the rig show.
+    1 where readings do not scatter, as far as they and the rig show, or a hand waits.
     """
     own = np.where(seen[name] == value, np.nan, seen[name])
     others = [seen[fellow] for fellow in fellows if fellow != name]
     alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if _lives(v)]
-    steps = np.concatenate([np.zeros(0), *(np.abs(np.diff(v[np.isfinite(v)])) for v in alive)])
-    steps, together = steps[steps > 0], all(_rests(v, at) for v in others)
-    if not steps.size or (together and name not in FORCE_CHANNELS):  # a hand that waits
+    waits = all(_rests(v, at) for v in others)
+    scatter = whiteness(alive) <= SCATTERS or (stated is not None and not waits)  # else there is no noise
+    if not any(_reach(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
         return 1.0
-    noise = noise_of(alive)
-    reach = max(_reach(v) for v in alive)
-    if noise <= ROUNDING * reach or whiteness(alive) > SCATTERS:
-        if stated is None or together:  # of no noise, or of motion above it
-            return 1.0
-        noise = stated
-    by_noise = float(steps.min()) / (2 * np.sqrt(np.pi) * noise)
     differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
     pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
-    return min(max(by_noise, (repeats + 1) / (pairs + 2)), 1.0)
+    return (repeats + 1) / (pairs + 2)
 
 
 def _lives(values: np.ndarray) -> bool:

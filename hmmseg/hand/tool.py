@@ -190,12 +190,6 @@ class FreeMotion:
     terms: np.ndarray
     window: float
 
-    def followed_by(self, more: FreeMotion, most: int) -> FreeMotion:
-        """Both together, of which the last `most` samples are kept."""
-        t, force = np.concatenate([self.t, more.t]), np.concatenate([self.force, more.force])
-        terms = np.concatenate([self.terms, more.terms], axis=1)
-        return FreeMotion(t[-most:], force[-most:], terms[:, -most:], more.window)
-
 
 def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
     """Forces (num_timesteps, 3) as the sensor reads them [N], NaN where missing."""

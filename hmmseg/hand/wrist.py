@@ -21,7 +21,7 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hand.grips import Grip, closings, free_samples, grip_of
-from hmmseg.hand.plausibility import REACH, Finding, all_changed, changed, length_unit
+from hmmseg.hand.plausibility import Finding, changed
 from hmmseg.hand.sensing import tool_warnings
 from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warnings, pose_of, smooth
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
@@ -35,15 +35,8 @@ CANCELLED = 0.05  # limit: share of either finger's way
 
 
 def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
-    """Positions and openings in other units; an opening that does not change, or is one finger's."""
+    """Openings in other units; one that does not change, or is one finger's."""
     gripper = rig.wrist
-    travels = {name: _travel(trial, name) for name in gripper.position.values()}
-    far = {name: travel for name, travel in travels.items() if travel > REACH}
-    if far:
-        name, travel = max(far.items(), key=lambda item: item[1])
-        unit, text = length_unit(travel)
-        problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {text}"
-        return [Finding(name, problem, all_changed(travels, rig, unit=unit))]
     for name in gripper.opening:
         values = trial.channels[name]
         widest, swing = float(np.nanmax(np.abs(values))), _travel(trial, name)
@@ -147,7 +140,7 @@ def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
 
 
 LEAST = 3  # numerics: samples; of fewer there is no scatter
-WENT = 4  # numerics: smoothing windows of a hand that goes somewhere before what it bears is judged
+WENT = 8  # numerics: smoothing windows of a hand that goes somewhere before what it bears is judged
 
 
 @dataclass(frozen=True)

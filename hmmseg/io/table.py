@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -159,19 +159,16 @@ def shown(value: object) -> str:
 def frame_table(source: Any, wanted: Sequence[str] | None) -> Table:
     """Table of a frame or dict; rows count from 1. InputError for anything else."""
     where = "DataFrame" if hasattr(source, "columns") else type(source).__name__
-    if isinstance(source, Mapping):
-        names = [str(name).strip() for name in source]
-        values = list(source.values())
-    elif hasattr(source, "columns") and hasattr(source, "iloc"):
-        names = [str(name).strip() for name in source.columns]
-        values = [source.iloc[:, i] for i in range(len(names))]
-    elif hasattr(source, "columns") and hasattr(source, "get_column"):
-        names = [str(name).strip() for name in source.columns]
-        values = [source.get_column(name) for name in source.columns]
+    if hasattr(source, "items"):  # a dict or a frame of pandas
+        named = list(source.items())
+    elif hasattr(source, "get_columns"):  # one of polars
+        named = list(zip(source.columns, source.get_columns(), strict=True))
     else:
         raise InputError(where, "is no table", "a file, a DataFrame or a dict of arrays")
+    names = [str(name).strip() for name, _ in named]
     check_unique(names, where)
-    kept = {n: _array(each) for n, each in zip(names, values, strict=True) if is_wanted(n, wanted)}
+    kept = {name: _array(values) for name, (_, values) in zip(names, named, strict=True)
+            if is_wanted(name, wanted)}  # fmt: skip
     return plain_table(where, kept, [name for name in names if name not in kept])
 
 

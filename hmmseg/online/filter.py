@@ -53,7 +53,7 @@ from hmmseg.online.hypothesis import (
     read,
     widen,
 )
-from hmmseg.segmentation.boundaries import evenly
+from hmmseg.segmentation.boundaries import evenly, normal
 from hmmseg.segmentation.changes import Prior, moment
 from hmmseg.segmentation.emissions import (
     MAX_RATE,
@@ -264,7 +264,10 @@ class Filter:
 
         `previous` [s]: the boundary before.
         """
-        touch, wrist = before.state == FREE or after.name == "place", self.rig.gripper is not None
+        if self.rig.gripper is not None and FREE in (before.state, after.state):
+            known = nearest_touch(tuple(self.touches), normal(mean, sd))
+            return known.quantile(0.5), known.sd
+        touch = before.state == FREE or after.name == "place"
         start = max(mean - REACH, previous)
         rows = [each for each in self.rows if start <= each[0] <= mean + max(self.lag, REACH)]
         if len(rows) < 2 * NEAREST or self._now[-1] > 0.5:
@@ -276,8 +279,8 @@ class Filter:
         there = {name: table[:, k] for k, name in enumerate(self.channels) if not np.isnan(table[:, k]).all()}
         if set(self.channels) - set(there) - set(self.optional):
             return None
-        timing = table[:, NUM_CHANNELS] if wrist else None
-        trial = Trial("stream", t, there, touches=tuple(self.touches), timing=timing)
+        timing = table[:, NUM_CHANNELS] if self.rig.gripper is not None else None
+        trial = Trial("stream", t, there, timing=timing)
         signals = thin(task_space(trial, self.rig), MAX_RATE, WINDOW)
         if signals.t.size < NEAREST:
             return None
@@ -304,8 +307,6 @@ class Filter:
         contact = contacts(signals, sense([], [], (), parameters, self.rig), parameters)
         change = contact.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
         out = evenly(t, probability) if change is None else moment(change)
-        if wrist and FREE in (before.state, after.state):
-            out = nearest_touch(tuple(self.touches), out)
         median = out.quantile(0.5)
         if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
             return None  # another event than the filter's

@@ -10,7 +10,7 @@ gripper stands.
 from __future__ import annotations
 
 import math
-from bisect import insort
+from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hand.grips import LEAST_CLOSING, REST, Closings, Grip, grip_of, least_swing
-from hmmseg.hand.tool import WINDOW, FreeMotion, Pose, Tool, applied_force, free_motion, pose_of, tool_of
+from hmmseg.hand.tool import WINDOW, Pose, Tool, applied_force, free_motion, pose_of, tool_of
 from hmmseg.hand.wrist import as_fingers, bears, grip_force_of, other_sign
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
@@ -27,9 +27,8 @@ from hmmseg.robust import bridged, white_sd
 WHERE = "stream"
 BATCH = 0.02  # numerics: s that are turned into fingers together
 BACKLOG = 10.0  # numerics: s before the first grip that are kept for the filter
-FREE = 1200  # numerics: samples of free motion that the tool is found from, ...
-APART = 8  # numerics: ... so many of them in a window
-KEPT = 30.0  # chosen: s for which a grip may turn out to be none
+APART = 8  # numerics: samples of free motion in a window from which the tool is found
+KEPT = 30.0  # chosen: s of rows from which the tool is found, and in which a grip may turn out to be none
 AROUND = 4  # numerics: windows kept before what is smoothed: it is then as in the whole recording
 TOUCHES = 8  # numerics: touches kept: a boundary looks back over fewer
 
@@ -44,13 +43,11 @@ class Wrist:
 
     def __init__(self, rig: Rig) -> None:
         self.rig, self.gripper, self.names = rig, rig.wrist, rig.wrist.channels
-        self._rows: list[tuple[float, tuple[float, ...]]] = []  # in order of time, a window's context
+        self._rows: list[tuple[float, tuple[float, ...]]] = []  # the last ones, in order of time
         self._out = -math.inf  # up to where rows have come out
         self._opening = Opening(rig.fingertip.normal_stiffness)
         self._newest = dict.fromkeys(self.names, math.nan)  # of each channel
         self._window: float | None = None
-        self._free: FreeMotion | None = None
-        self._free_until = -math.inf
         self._fitted = 0  # grips before which the tool was found
         self.tool: Tool | None = None
         self.touches: list[tuple[float, float]] = []
@@ -97,12 +94,10 @@ class Wrist:
         if not self._rows:
             return []
         newest, opening = self.newest, self._opening
+        if self._rows[0][0] < newest - 1.5 * KEPT:
+            self._rows = self._since(newest - KEPT)
         if self.tool is None and not (opening.number or final):
-            if self._rows[0][0] < newest - BACKLOG:  # older free motion is kept as what it says of the tool
-                trial = self._trial()
-                if _has_values(trial):
-                    self._gather(trial, self._posed(trial), newest - BACKLOG / 2)
-                self._rows = [each for each in self._rows if each[0] >= newest - BACKLOG / 2]
+            self._out = max(self._out, newest - BACKLOG)
             return []
         until = newest if final else min(newest - (self._window or 0.0), opening.known)
         if not final and until < self._out + BATCH and self._fitted == opening.number:
@@ -110,11 +105,11 @@ class Wrist:
         self._return()
         out = self._turned(until)
         self._out = max(self._out, until)
-        keep, held = self._out, opening.held or opening.refused
-        if held is not None and held.start > self._out - KEPT:
-            keep = min(keep, held.start)
-        self._rows = [each for each in self._rows if each[0] > keep - AROUND * (self._window or 0.0)]
         return out
+
+    def _since(self, t: float) -> list[tuple[float, tuple[float, ...]]]:
+        """Rows from t [s] on."""
+        return self._rows[bisect_left(self._rows, t, key=lambda each: each[0]) :]
 
     def _return(self) -> None:
         """Go back to where a grip began that was none."""
@@ -125,11 +120,12 @@ class Wrist:
             self.back = True
             self._out = max(t for t, _ in self._rows if t < refused.start)
             self.touches = [touch for touch in self.touches if touch[0] <= self._out]
-        self._free_until = min(self._free_until, self._out)
 
-    def _trial(self) -> Trial:
-        values = np.array([row for _, row in self._rows])
-        return Trial(WHERE, np.array([t for t, _ in self._rows]),
+    def _trial(self, since: float) -> Trial:
+        """Rows from a time [s] on."""
+        rows = self._since(since)
+        values = np.array([row for _, row in rows]).reshape(len(rows), -1)
+        return Trial(WHERE, np.array([t for t, _ in rows]),
                      {name: values[:, i] for i, name in enumerate(self.names)})  # fmt: skip
 
     def _posed(self, trial: Trial) -> Pose:
@@ -141,32 +137,33 @@ class Wrist:
         """Opening (num_timesteps,) [m], gaps bridged."""
         return np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
 
-    def _gather(self, trial: Trial, pose: Pose, until: float) -> None:
-        """Add free motion up to `until` to what the tool is found from."""
-        free = self._opening.free(trial.t, self._opened(trial)) & (trial.t > self._free_until)
+    def _find_tool(self, until: float) -> None:
+        """Find the tool from free motion up to a time [s]; it stays as it was where there is none."""
+        trial = self._trial(-math.inf)
+        if not _has_values(trial):
+            return
+        pose = self._posed(trial)
+        free = np.flatnonzero(self._opening.free(trial.t, self._opened(trial)) & (trial.t <= until))
         step = max(1, round(pose.window / APART / float(np.median(np.diff(trial.t)))))
-        picked = np.flatnonzero(free & (trial.t <= until))[::step]
-        self._free_until = max(self._free_until, min(until, float(trial.t[-1])))
-        if picked.size:
-            found = free_motion(trial, self.rig, pose, np.isin(np.arange(trial.t.size), picked))
-            self._free = found if self._free is None else self._free.followed_by(found, FREE)
+        mask = np.zeros(trial.t.size, bool)
+        mask[free[::step]] = True
+        if self.tool is None or mask.any():
+            motion = free_motion(trial, self.rig, pose, mask)
+            since = float(motion.t.mean()) if motion.t.size else 0.0
+            self.tool = tool_of(WHERE, self.rig, motion, since, between=self._fitted > 1)
 
     def _turned(self, until: float) -> list[tuple[float, np.ndarray]]:
         """Rows up to `until` as those of two fingers."""
-        trial, opening = self._trial(), self._opening
-        if not _has_values(trial):
-            return [(t, np.full(16, np.nan)) for t, _ in self._rows if self._out < t <= until]
-        pose, first = self._posed(trial), self.tool is None
-        self._gather(trial, pose, until)
-        if first or self._fitted != opening.number:
-            self._fitted = opening.number
-            self.mark = None if opening.held is None else opening.held.start
-            motion = self._free or free_motion(trial, self.rig, pose, np.zeros(trial.t.size, bool))
-            if first or motion.t.size:
-                since = float(motion.t.mean()) if motion.t.size else 0.0
-                self.tool = tool_of(WHERE, self.rig, motion, since, between=self._fitted > 1)
-        assert self.tool is not None
-        return self._as_rows(trial, pose, self.tool, until)
+        held = self._opening.held
+        if self.tool is None or self._fitted != self._opening.number:
+            self._fitted = self._opening.number
+            self.mark = None if held is None else held.start
+            self._find_tool(until)
+        since = self._out if held is None or held.judged else min(held.start, self._out)
+        trial = self._trial(since - AROUND * self.delay)
+        if self.tool is None or not _has_values(trial):
+            return [(t, np.full(16, np.nan)) for t in trial.t.tolist() if self._out < t <= until]
+        return self._as_rows(trial, self._posed(trial), self.tool, until)
 
     def _as_rows(self, trial: Trial, pose: Pose, tool: Tool, until: float) -> list[tuple[float, np.ndarray]]:
         force, near, grips = applied_force(trial, self.rig, pose, tool), np.zeros(trial.t.size), []
@@ -241,14 +238,14 @@ class Held:
 class Opening(Closings):
     """Follows an opening, sample by sample, between pads of a stiffness [N/m].
 
-    `grips`: the last two. `known` [s]: up to when it is known what is held. `number`: grips so far.
-    `refused`: the last one, where it was none.
+    `grips`: those of the last KEPT s. `known` [s]: up to when it is known what is held. `number`: grips so
+    far. `refused`: the last one, where it was none.
     """
 
     def __init__(self, stiffness: float) -> None:
         super().__init__(LEAST_CLOSING)
         self.stiffness, self.number, self.known = stiffness, 0, -math.inf
-        self.grips: deque[Held] = deque(maxlen=2)
+        self.grips: list[Held] = []
         self.refused: Held | None = None
         self._way: deque[tuple[float, float, float]] = deque()  # since it was widest
         self._low, self._high = math.inf, -math.inf
@@ -304,6 +301,7 @@ class Opening(Closings):
         if grip is None:
             self._restart(t, opening)
             return
+        self.grips = [each for each in self.grips if each.stop > t - KEPT]
         self.grips.append(Held(max(float(times[grip.start]), self.known), grip))
         self.refused, self.known, self._wide = None, t, math.nan
         self.number += 1

@@ -78,14 +78,6 @@ def test_missing_cells_and_uneven_times(tmp_path):
     assert np.isfinite(signals.fy[[3, 5]]).all()
 
 
-@pytest.mark.parametrize("rate", [10.0, 20.0, 1000.0, 5000.0])
-def test_rate(rate):
-    frame = table()
-    frame["t"] = np.arange(12) / rate
-    frame.loc[11, "t"] += 3.0  # a pause is not the rate
-    assert read_trial(frame, JOINTED).rate == pytest.approx(rate)
-
-
 def test_integers_and_nullable_columns():
     frame = table()
     frame["fx1"] = pd.array([1, None] * 6, dtype="Int64")
@@ -169,11 +161,6 @@ def test_plain_task_refusals():
         read_trial(table(("fx", "fy")), task=SequenceTask(("a",), channels=("fz",)))
     with pytest.raises(ValueError, match="a block task's trial needs its rig"):
         read_trial(table())
-
-
-def test_cartesian_hand_needs_its_columns():
-    with pytest.raises(InputError, match="column x1: missing; expected t, x1, y1, vx1"):
-        read_trial(table(JOINT_CHANNELS), CARTESIAN)
 
 
 @pytest.mark.parametrize(

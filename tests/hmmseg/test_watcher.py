@@ -1,14 +1,13 @@
 """A task followed while it runs: the same physics as off line, nothing looked ahead, nothing lost."""
 
-import io
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from estimation.identification import identify_aligned
+from experiments.wrist import ARM_RIG
 from experiments.wrist_scene import BLOCKS, Setup, performances, wrist_recording, wrist_rig
 from experiments.wrist_scene import TASK as RESTACK
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
@@ -16,7 +15,7 @@ from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.formats import read_table
-from hmmseg.io.rig import Rig, parse_rig
+from hmmseg.io.rig import Rig
 from hmmseg.io.task import Task, read_task
 from hmmseg.io.trial import Trial, trial_of
 from hmmseg.online import hypothesis as one
@@ -26,7 +25,6 @@ from hmmseg.online.watcher import Watcher
 from hmmseg.online.wrist import Opening
 from hmmseg.segmentation.align import align, segment
 from hmmseg.segmentation.emissions import STILL, Parameters, _log_halting, features, log_likelihoods
-from hmmseg_cli.main import main
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 CASE = RECORDINGS / "paper_blocks"
@@ -357,38 +355,11 @@ def test_an_opening_is_read_as_it_comes():
 def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
     """As when a block drops out of the grip in mid-air; what is smoothed errs alike, but not so much."""
     folder = shared / "panda" / "wrist_restack_1"
-    rig = parse_rig({
-        "gravity": 9.81,
-        "gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width", "wrench": ["Fx", "Fy", "Fz"]},
-        "fingertip": {"normal_stiffness": 3735.0, "shear_stiffness": 2500.0},
-    })  # fmt: skip
-    raw = trial_of(read_table(folder / "wrist_01.csv", None), rig, None)
+    raw = trial_of(read_table(folder / "wrist_01.csv", None), ARM_RIG, None)
     columns = {"t": raw.t} | raw.channels
     gone = (raw.t > 4.36) & (raw.t < 5.78)
     columns["Fz"] = columns["Fz"] + 0.466 * gone
-    _, lines, final = follow_wrist(columns, rig, read_task(folder / "task.toml"))
+    _, lines, final = follow_wrist(columns, ARM_RIG, read_task(folder / "task.toml"))
     assert not final["fits"]
     first = next(line["t"] for line in lines if not line["fits"])
     assert 4.36 < first < 4.86
-
-
-def test_the_command_follows_a_wrist(performed, monkeypatch, capsys, tmp_path):
-    _, columns = performed
-    (tmp_path / "task.toml").write_text(
-        '[objects.a]\non = "b"\n[objects.b]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n'
-        '[[moves]]\nobject = "b"\nto = "a"\n'
-    )
-    (tmp_path / "rig.toml").write_text(
-        '[gripper]\nposition = ["px", "py", "pz"]\nopening = "gap"\nwrench = ["Fx", "Fy", "Fz"]\n'
-        "[fingertip]\nnormal_stiffness = 4000.0\nshear_stiffness = 2500.0\n"
-    )
-    rows = [
-        ",".join(columns),
-        *(",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True)),
-    ]
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("\n".join(rows).encode() + b"\n")))
-    code = main(["watch", "--task", str(tmp_path / "task.toml"), "--rig", str(tmp_path / "rig.toml")])
-    out, err = capsys.readouterr()
-    assert code == 0 and err == ""
-    lines = [json.loads(line) for line in out.splitlines()]
-    assert len(lines) == len(rows) and lines[-1]["fits"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.identification import identify_aligned
+from experiments.wrist import ARM_RIG, SETUPS
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
 from hmmseg.hand.grips import closings, grip_of
@@ -35,18 +36,11 @@ def raw(simulated, setup, **said):
     return trial_of(frame_table(wrist_recording(simulated, setup), None), rig, None), rig
 
 
-SETUPS = {
-    "as it is": (PLAIN, {}),
-    "reaction, untared": (Setup(reaction=True, offset=(3.0, -2.0, 8.0)), {}),
-    "all said": (Setup(reaction=True), {"reaction": True, "sensor_axes": ["y", "x", "-z"], "tool_mass": 0.7}),
-    "turning, untared": (Setup(heading=0.9, tilt=0.1, offset=(1.0, 2.0, 3.0), reaction=True), {}),
-    "world, drifting": (Setup(frame="world", drift=0.02), {}),
-    "poor": (Setup(noise=0.05, position_noise=2e-4), {}),
-    "500 Hz": (Setup(rate=500.0, noise=0.03), {}),
-}
-
-
-@pytest.mark.parametrize("name", SETUPS)
+@pytest.mark.parametrize(
+    "name",
+    ["as it is", "reaction, untared", "all said", "turning, untared", "world's axes, drifting",
+     "poor sensors", "500 Hz"],
+)  # fmt: skip
 def test_blocks_and_boundaries_from_the_wrist_alone(performed, name):
     setup, said = SETUPS[name]
     trials, rig = read_all(performed, setup, **said)
@@ -202,14 +196,8 @@ def test_halves_of_a_wrist_are_no_fingers(performed):
 
 def test_an_arm_of_another_simulator(shared):
     folder = shared / "panda" / "wrist_restack_1"
-    rig = parse_rig({
-        "gravity": 9.81,
-        "gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width", "wrench": ["Fx", "Fy", "Fz"]},
-        "columns": {"width": {"offset": -1.02e-3}},  # between the pads, as its own two-finger files have it
-        "fingertip": {"normal_stiffness": 3735.0, "shear_stiffness": 2500.0},
-    })  # fmt: skip
-    aligned = align([read_trial(folder / f"wrist_0{k}.csv", rig) for k in (1, 2, 3, 4)],
-                    read_task(folder / "task.toml"), rig)  # fmt: skip
+    aligned = align([read_trial(folder / f"wrist_0{k}.csv", ARM_RIG) for k in (1, 2, 3, 4)],
+                    read_task(folder / "task.toml"), ARM_RIG)  # fmt: skip
     truth = [
         json.loads((folder / "truth" / f"trial_0{k}.json").read_text())["boundaries"] for k in (1, 2, 3, 4)
     ]

@@ -8,7 +8,6 @@ what holds at each sample.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import pyarrow.parquet as pq
 
 from hmmseg.errors import InputError
 from hmmseg.io.formats.parquet import to_columns
+from hmmseg.io.schema import read_json
 from hmmseg.io.table import Table, check_part, plain_table
 
 EPISODE = "episode_index"
@@ -28,11 +28,8 @@ PERSISTENT, EVENTS = "language_persistent", "language_events"
 def read_info(folder: Path) -> dict[str, Any]:
     """Table of meta/info.json."""
     path = folder / "meta/info.json"
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(str(path), f"cannot be read ({error})", "a LeRobot data set") from None
-    if not isinstance(info, dict) or not isinstance(info.get("features"), dict):
+    info = read_json(path, "a LeRobot data set")
+    if not isinstance(info.get("features"), dict):
         raise InputError(str(path), "has no features", "a LeRobot data set of version 2 or 3")
     return info
 

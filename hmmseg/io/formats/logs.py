@@ -363,16 +363,12 @@ def interpolated(ticks: np.ndarray, times: np.ndarray, values: np.ndarray) -> tu
     times, values = times[there], values[there]
     if not times.size:
         return np.full(ticks.size, np.nan), np.zeros(ticks.size, dtype=bool)
-    after = np.searchsorted(times, ticks, side="left")
-    exact = (after < times.size) & (times[np.minimum(after, times.size - 1)] == ticks)
-    inside = (after > 0) & (after < times.size)
-    low, high = np.clip(after - 1, 0, None), np.minimum(after, times.size - 1)
-    span = times[high] - times[low]
-    near = inside & (span > 0) & (span <= GAP * _period(times))
-    share = np.where(near, (ticks - times[low]) / np.where(near, span, 1), 0.0)
-    between = values[low] + share * (values[high] - values[low])
-    out = np.where(exact, values[high], np.where(near, between, np.nan))
-    return out, near & ~exact
+    exact = np.isin(ticks, times)
+    span = np.pad(np.diff(times), 1)[np.searchsorted(times, ticks)]  # 0 before the first and after the last
+    near = ~exact & (span > 0) & (span <= GAP * _period(times))
+    # Times in ns are too large for floating-point numbers, their differences are not.
+    out = np.interp(ticks - times[0], times - times[0], values)
+    return np.where(exact | near, out, np.nan), near
 
 
 def _period(times: np.ndarray) -> float:
