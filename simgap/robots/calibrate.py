@@ -335,12 +335,4 @@ def _held_out(
         point, _, _ = _least_squares(seen, found, AGAIN, free)
         part = composed.along(np.unique(rows.log[mine]).tolist())
         after[mine] = rows.observed[mine] - base_at(part, point).rows
-    return _rms(composed, before), _rms(composed, after)
-
-
-def _rms(composed: Composed, left: np.ndarray) -> dict[str, float]:
-    out = {}
-    for c, name in enumerate(composed.rows.channels):
-        mine = left[composed.rows.channel == c]
-        out[name] = float(np.sqrt(np.mean(mine**2))) if np.isfinite(mine).all() else np.nan
-    return out
+    return rows.rms(before), rows.rms(after)

@@ -273,7 +273,7 @@ def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str
     found = []
     for i, j in zip(*np.triu_indices(len(at), 1), strict=True):
         one, other = sets.names[single[i]], sets.names[single[j]]
-        closed = {(e.reads, e.command is not None) for e in (effects[one], effects[other])}
+        closed = {(e.alter is not None, e.command is not None) for e in (effects[one], effects[other])}
         if closed == {(True, False), (False, True)} and ALIKE < abs(alike[i, j]) < SAME:
             found.append((one, other, float(-alike[i, j] * length[i] / length[j])))
     return found
