@@ -32,7 +32,8 @@ class RobotEffect(Effect):
     drives took them. `model` maps short names to the simulator's parameters. What is `fitted` is fitted along
     with every cause and is none itself; `widened`: how many usual sizes its parameters' sd are, where that is
     of what a model states and nobody measured; `by_log`: each log has its own parameters, which no other log
-    tells.
+    tells; `numeric`: it is of the simulator's own numerics (its step, how it holds commands), `dear` where
+    that costs another run of every window.
     """
 
     alter: Alter | None = None
@@ -42,6 +43,8 @@ class RobotEffect(Effect):
     fitted: bool = False
     widened: float = 0.0
     by_log: bool = False
+    numeric: bool = False
+    dear: bool = False
 
     def label(self, short: str) -> str:
         """A parameter's name: the effect's, and its own where that has several."""

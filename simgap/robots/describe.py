@@ -109,7 +109,7 @@ def _fitted(found: RobotDiagnosis, numeric: bool) -> dict[str, Any]:
     apart."""
     out = {}
     for name, before in found.plain.point.items():
-        if found.composed.numeric(name) is not numeric:
+        if found.composed.effects[name].numeric is not numeric:
             continue
         effect = found.composed.effects[name]
         for short, value in before.items():

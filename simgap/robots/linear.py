@@ -193,7 +193,7 @@ def _rows_at(
     effect = composed.effects[name]
     moved = {**base.point, name: dict(values)}
     if effect.alter is None:
-        if composed.numeric(name):
+        if composed.effects[name].numeric:
             run, now = list(base.true), {**effect.neutral(), **base.point.get(name, {})}
             for short, value in values.items():
                 run = composed.stepped(run, name, short, value - now[short])

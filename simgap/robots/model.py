@@ -112,10 +112,6 @@ class Composed:
                     out[self.effects[name].model[short]] = value
         return out
 
-    def numeric(self, effect: str) -> bool:
-        """Whether an effect is of the simulator's own numerics."""
-        return is_numeric(self.simulator, self.effects[effect])
-
     def moved(self, point: Point) -> Composed:
         """The same, with what the simulator's own numbers do as it is at this point."""
         return replace(self, about=dict(point), _slopes={})
@@ -124,19 +120,14 @@ class Composed:
         """True channels of every window from these starts; None where a rollout diverged."""
         out = self._rolled(self._without_dear(point), self.windows, starts)
         for name, theta in point.items():
-            if self.dear(name):
+            if self.effects[name].dear:
                 neutral = self.effects[name].neutral()
                 for short, value in theta.items():
                     out = self.stepped(out, name, short, value - neutral[short])
         return out
 
-    def dear(self, effect: str) -> bool:
-        """Whether an effect of the simulator's own numerics costs another run of every window."""
-        dear = getattr(self.simulator, "dear", getattr(self.simulator, "numerics", ()))
-        return any(p in dear for p in self.effects[effect].model.values())
-
     def _without_dear(self, point: Point) -> Point:
-        return {n: v for n, v in point.items() if not self.dear(n)}
+        return {n: v for n, v in point.items() if not self.effects[n].dear}
 
     def stepped(
         self, true: Sequence[Channels | None], name: str, short: str, by: float
@@ -226,11 +217,6 @@ class Composed:
 
     def _acting(self, point: Point) -> list[tuple[RobotEffect, dict[str, float]]]:
         return [(self.effects[n], {**self.effects[n].neutral(), **v}) for n, v in point.items()]
-
-
-def is_numeric(simulator: Simulator, effect: RobotEffect) -> bool:
-    """Whether an effect is of the simulator's own numerics: its step, how it holds commands."""
-    return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
 
 
 def _sum(one: Channels | None, other: Channels, by: float) -> Channels | None:

@@ -30,7 +30,6 @@ from simgap.robots.sets import (
     Sets,
     cancelling,
     identifiability,
-    log_odds,
     neighbours,
     pairs,
     point_of,
@@ -40,6 +39,7 @@ from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener
 from simgap.robots.windows import STRIKES
 from simgap.simulators.protocol import Parameter
 
+EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are judged by
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, what tells how far straight lines are off of what takes a cause's place
@@ -118,7 +118,8 @@ class Search:
     @property
     def log_odds(self) -> float:
         """Prior log odds of one candidate to act."""
-        return log_odds(len(self.wanted))
+        share = min(EXPECTED / max(len(self.wanted), 1), 0.5)
+        return float(np.log(share / (1 - share)))
 
     def run(self, tell: Progress) -> Settled:
         """The best set: from nothing on, and where that leaves more than calibration does, from there
@@ -149,7 +150,9 @@ class Search:
         there promise more: commands in steps are nearly those in lines that come later, and no small step
         leads from one to the other."""
         effects = self.composed.effects
-        for name in (n for n in self.along if self.composed.numeric(n) and not self.composed.dear(n)):
+        for name in (
+            n for n in self.along if self.composed.effects[n].numeric and not self.composed.effects[n].dear
+        ):
             for short, known in effects[name].parameters.items():
                 if np.isfinite([known.low, known.high]).all():
                     near_low = best.point[name][short] < 0.5 * (known.low + known.high)

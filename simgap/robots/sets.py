@@ -30,7 +30,6 @@ from simgap.robots.whiten import Whitener
 TURNS = 6  # numerics: of reweighted least squares
 ALIKE, SAME = 0.7, 0.99999  # numerics: correlations of columns that nearly cancel, and that are one
 SEEN = 1.0  # numerics: noise deviations that a usual size moves all rows by, together
-EXPECTED = 1.0  # prior: how many of all candidates act
 
 Names = tuple[str, ...]
 
@@ -248,12 +247,6 @@ def point_of(
         }
         at += len(known)
     return out
-
-
-def log_odds(count: int) -> float:
-    """Prior log odds of one of so many candidates to act."""
-    share = min(EXPECTED / max(count, 1), 0.5)
-    return float(np.log(share / (1 - share)))
 
 
 def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
