@@ -1,5 +1,7 @@
 # On a fresh machine with Python >= 3.11, pip and make, every target sets itself up first.
 PYTHON ?= python3
+# As the command has it: matrices are many and small.
+export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
@@ -112,7 +114,6 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 
 sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md
 	$(BIN)/python -m experiments.real.sts3215 $(SET) --cases 4 --seed 4 --output experiments/results/sts3215.json
-	$(BIN)/python -m experiments.real.bam $(SET) --output experiments/results/sts3215_bam.json
 	$(BIN)/python -m experiments.write_tables
 
 REAL := $(or $(RECORDINGS),../shared/real)

@@ -28,8 +28,8 @@ from hmmseg.io.units import UNITS
 from hmmseg.levels import CERTAIN, MOVED
 from hmmseg.segmentation.align import AlignedTrials
 
-NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.0035
-SMALL = 0.005  # chosen: p-value from which a check warns; a result has up to a dozen of them
+NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.003
+SMALL = (1 - CERTAIN) / len(CHANNELS)  # p-value from which a check warns, so that a result surely has none
 MEANING = {
     "force": "the net vertical force while carried differs between grips",
     "distance": "the distance of the fingers while held differs between grips",
@@ -96,35 +96,28 @@ LIGHT = 1500.0  # limit: [kg/m^3]: plastics and stone, of which the unit that ma
 
 def soft_pads(design: Design, rig: Rig) -> list[str]:
     """Pads that give otherwise than the rig says, as every grip shows while its force changes."""
-    out, tip = [], unit_pads(rig)
-    for kind, share, odds, compliance in (
-        ("normal", design.doubt.normal, design.doubt.odds[0], tip.normal1),
-        ("shear", design.doubt.shear, design.doubt.odds[1], tip.shear1),
-    ):  # fmt: skip
+    out, pads = [], unit_pads(rig)
+    for prop, (kind, doubt) in zip(("widths", "heights"), design.doubts.items(), strict=True):
         stated = getattr(rig.fingertip, f"{kind}_stiffness")
-        if odds < CERTAIN:
+        if doubt.odds < CERTAIN:
             continue
-        true = compliance * (share + (1.0 if np.isfinite(stated) else 0.0))
+        true = getattr(pads, f"{kind}1") * (doubt.share + (1.0 if np.isfinite(stated) else 0.0))
         seen = f"about {1 / true:.2g} N/m" if true > 0 else "no give at all, or forces that are late"
         out.append(
             f"[fingertip] {kind}_stiffness = {stated:g}, but readings within each grip show {seen}: "
-            f"{'widths' if kind == 'normal' else 'heights'} allow for it"
+            f"{prop} allow for it"
         )
     return out
 
 
 def unstated_pads(design: Design) -> list[str]:
     """Pads whose stiffness the rig leaves open: what is certain of them is what the recordings show."""
-    doubt, props = design.doubt, {u.prop for u in design.unknowns}
-    found = {
-        "normal": ("width", doubt.normal, doubt.normal_give),
-        "shear": ("height", doubt.shear, doubt.shear_give),
-    }
+    props = {u.prop for u in design.unknowns}
     return [
         f"the rig states no [fingertip] {kind}_stiffness: {prop}s allow for pads that give as much as the "
         "readings within each grip leave open; with the stiffness measured they are surer"
-        for kind, (prop, surprising, give) in found.items()
-        if give and not surprising and prop in props
+        for prop, (kind, doubt) in zip(("width", "height"), design.doubts.items(), strict=True)
+        if doubt.give and not doubt.share and prop in props
     ]
 
 

@@ -197,38 +197,37 @@ def _longer_link(finger: int, link: int):
 
 @dataclass(frozen=True)
 class PadDoubt:
-    """What recordings show of the pads and the rig does not admit: how much softer they are, as shares.
+    """What recordings show of both pads along the grip, or in shear, and the rig does not admit.
 
-    `normal`, `shear`: along the grip and in shear the compliance seems 1 + share times the nominal; `odds`
-    are the probabilities that the rig is so wrong; where it is `doubted`, the extra prior sd is as large as
-    the share. `apart`: what slopes along the grip and in shear are off by alike. `normal_give`, `shear_give`:
-    how much pads may give, by what the recordings show, whose stiffness the rig leaves unstated; 0 where it
-    states one. `usual_normal`, `usual_shear`: forces of one finger as they usually are in a grip, and where a
-    block is put down [N]. `seen`: those shares and their sds whatever the odds, infinite where unknown.
+    Their compliance seems 1 + `share` times the nominal; `odds` is the probability that the rig is so wrong.
+    `apart`: what slopes are off by alike. `give`: how much pads may give, by what the recordings show, whose
+    stiffness the rig leaves unstated; 0 where it states one. `usual`: force of one finger as it usually is in
+    a grip, or where a block is put down [N]. `seen`: that share and its sd whatever the odds, infinite where
+    unknown.
     """
 
-    normal: float = 0.0
-    shear: float = 0.0
-    normal_give: float = 0.0
-    shear_give: float = 0.0
-    usual_normal: float = 1.0
-    usual_shear: float = 1.0
-    odds: tuple[float, float] = (0.0, 0.0)
-    doubted: bool = False
-    apart: tuple[float, float] = (0.0, 0.0)
-    seen: tuple[tuple[float, float], tuple[float, float]] = ((0.0, np.inf), (0.0, np.inf))
+    share: float = 0.0
+    odds: float = 0.0
+    apart: float = 0.0
+    give: float = 0.0
+    usual: float = 1.0
+    seen: tuple[float, float] = (0.0, np.inf)
 
-    def extra_sd(self, kind: str) -> float:
-        """Prior standard deviation of the share, "normal" or "shear", beyond what the rig admits."""
-        return abs(getattr(self, kind)) if self.doubted else 0.0
+    @property
+    def extra_sd(self) -> float:
+        """Prior standard deviation of the share beyond what the rig admits.
 
-    def slope_sd(self) -> np.ndarray:
-        """Standard deviations (3,) by channel of what slopes are off by alike and each of its own.
+        That of 0 where the rig is right, and of as much as the slopes show where it is not.
+        """
+        return abs(self.share) * float(np.sqrt(self.odds))
+
+    @property
+    def slope_sd(self) -> float:
+        """What slopes are off by alike and each of its own.
 
         A share of what truly gives, and what noise of forces or places may make of all of them.
         """
-        usual = SLOPE_SD * np.array([1.0, self.normal_give or 1.0, self.shear_give or 1.0])
-        return np.hypot(usual, [0.0, *self.apart])
+        return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 
 def _softer_pads(fingers: tuple[int, ...], axis: str):
@@ -269,11 +268,13 @@ def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
     return replace(signals, x1=signals.x1 - size / 2, x2=signals.x2 + size / 2)
 
 
-def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0.0) -> tuple[Nuisance, ...]:
+def nuisances(
+    rig: Rig, biased: np.ndarray, doubts: Mapping[str, PadDoubt], touch_sd: float = 0.0
+) -> tuple[Nuisance, ...]:
     """The deviations that the rig admits, and those that recordings show as well.
 
-    `biased` (4,): extra prior sd of each force bias [N]; `doubt`: of the pads' compliances; `touch_sd`
-    [m]: how well the distance is known at which the fingers touch a block.
+    `biased` (4,): extra prior sd of each force bias [N]; `doubts`: of the pads, "normal" and "shear";
+    `touch_sd` [m]: how well the distance is known at which the fingers touch a block.
     """
     s, out = rig.systematic, list[Nuisance]()
 
@@ -291,23 +292,21 @@ def nuisances(rig: Rig, biased: np.ndarray, doubt: PadDoubt, touch_sd: float = 0
             admit(f"link_length.{finger}{link + 1}", sd, 1e-5, _longer_link(finger, link))
     # What slopes show is compliance and exponent together, so either may be off by as much as both; the bend
     # is that of what gives.
-    stated = min(max(doubt.extra_sd("normal"), *s.pad_stiffness) / np.log(2), MOST_BENT)
-    bends = {"normal": MOST_BENT * doubt.normal_give or stated, "shear": MOST_BENT * doubt.shear_give}
+    stated = min(max(doubts["normal"].extra_sd, *s.pad_stiffness) / np.log(2), MOST_BENT)
     # Pads of one hand are of one make: of what their stiffness is stated to be in doubt by, most is common.
     common = min(s.pad_stiffness) * np.sqrt(1 - UNLIKE**2)
-    for axis, kind in (("x", "normal"), ("y", "shear")):
-        found, give = doubt.extra_sd(kind), getattr(doubt, f"{kind}_give")
-        admitted = 0.0 if give else common
-        both = max(found, UNSTATED if give else 0.0)
-        both = float(np.hypot(np.hypot(both, bends[kind]) if both else 0.0, admitted))
+    for axis, (kind, doubt) in zip("xy", doubts.items(), strict=True):
+        bend = MOST_BENT * doubt.give or (stated if kind == "normal" else 0.0)
+        admitted = 0.0 if doubt.give else common
+        both = max(doubt.extra_sd, UNSTATED if doubt.give else 0.0)
+        both = float(np.hypot(np.hypot(both, bend) if both else 0.0, admitted))
         admit(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis))
         for finger in (1, 2):
-            own = 0.0 if give else s.pad_stiffness[finger - 1]
-            sd = np.sqrt(own**2 - admitted**2 + (UNLIKE * max(found, give)) ** 2)
+            own = 0.0 if doubt.give else s.pad_stiffness[finger - 1]
+            sd = np.sqrt(own**2 - admitted**2 + (UNLIKE * max(doubt.extra_sd, doubt.give)) ** 2)
             admit(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis))
         if any(n.name.startswith(f"pad_{kind}") for n in out):
-            usual = max(getattr(doubt, f"usual_{kind}"), 1e-3)
-            admit(f"pad_{kind}_exponent", bends[kind], 1e-3, _bent_pads(axis, usual))
+            admit(f"pad_{kind}_exponent", bend, 1e-3, _bent_pads(axis, max(doubt.usual, 1e-3)))
     admit("touch", touch_sd, 1e-5, _wider)
     return tuple(out)
 
@@ -347,48 +346,45 @@ def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.nda
     return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in found])
 
 
-def pad_doubt(
+def pad_doubts(
     slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
-) -> PadDoubt:
-    """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, and usual forces.
+) -> dict[str, PadDoubt]:
+    """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, "normal" and "shear".
 
     `variance`, `alike`: as in `slope_variances`, of all trials. A share that several kinds of slope find is
     that of the surest of them.
     """
-    admitted = float(np.hypot(*rig.systematic.pad_stiffness)) / 2
-    found, possible, shared = {}, {}, {}
-    surest, tip = {DISTANCE: (0.0, np.inf), RISE: (0.0, np.inf)}, rig.fingertip
-
-    def seen(kinds: Sequence[int]) -> list[np.ndarray]:
-        known = np.isfinite(slopes[..., kinds])
-        return [values[..., kinds][known] for values in (slopes, variance, alike)]
-
-    for channel, stiffness in ((DISTANCE, tip.normal_stiffness), (RISE, tip.shear_stiffness)):
-        stated = bool(np.isfinite(stiffness))
-        kinds = [k for k, (c, _) in enumerate(SLOPES.values()) if c == channel]
-        share, spread, together = seen(kinds)
-        shared[channel], found[channel] = shared_error(together, spread), (0.0, 0.0)
-        possible[channel] = 0.0 if stated else possible_share(share, spread)
-        for k in kinds:
-            share, spread, together = seen([k])
-            apart = shared_error(together, spread)
-            if share.size:
-                middle, error = middle_share(share, spread, 0.0)
-                one = middle, float(np.hypot(error, apart))
-                surest[channel] = min(surest[channel], one, key=itemgetter(1))
-            said = misstated(share, spread, stated, admitted if stated else 0.0, apart)
-            found[channel] = max(found[channel], said, key=itemgetter(1))
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
     for s, grip in ((a.signals, grip) for a in weighed for grip in a.weights.grips.values()):
         along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
         usual.append((np.mean(grip["distance"] @ along), abs(np.mean(grip["place"] @ up))))
-    normal, shear = np.median(usual, axis=0).tolist()
+    admitted, out = float(np.hypot(*rig.systematic.pad_stiffness)) / 2, {}
     # A width reads too small by the share of the give that the rig leaves out, a height too large.
-    return PadDoubt(
-        -found[DISTANCE][0], found[RISE][0], possible[DISTANCE], possible[RISE], normal, shear,
-        (found[DISTANCE][1], found[RISE][1]), apart=(shared[DISTANCE], shared[RISE]),
-        seen=((-surest[DISTANCE][0], surest[DISTANCE][1]), surest[RISE]),
-    )  # fmt: skip
+    for (kind, channel, sign), force in zip(
+        (("normal", DISTANCE, -1.0), ("shear", RISE, 1.0)), np.median(usual, axis=0).tolist(), strict=True
+    ):
+        stated = bool(np.isfinite(getattr(rig.fingertip, f"{kind}_stiffness")))
+        mine = [k for k, (c, _) in enumerate(SLOPES.values()) if c == channel]
+
+        def seen(kinds: Sequence[int]) -> list[np.ndarray]:
+            known = np.isfinite(slopes[..., kinds])
+            return [values[..., kinds][known] for values in (slopes, variance, alike)]
+
+        found, surest = (0.0, 0.0), (0.0, np.inf)
+        for k in mine:
+            share, spread, together = seen([k])
+            apart = shared_error(together, spread)
+            if share.size:
+                middle, error = middle_share(share, spread, 0.0)
+                surest = min(surest, (sign * middle, float(np.hypot(error, apart))), key=itemgetter(1))
+            said = misstated(share, spread, stated, admitted if stated else 0.0, apart)
+            found = max(found, said, key=itemgetter(1))
+        share, spread, together = seen(mine)
+        out[kind] = PadDoubt(
+            sign * found[0], found[1], shared_error(together, spread),
+            0.0 if stated else possible_share(share, spread), force, surest,
+        )  # fmt: skip
+    return out
 
 
 def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
@@ -490,7 +486,7 @@ class Design:
     `slope_sd` (3,): by channel, the error that all slopes have alike and each has of its own.
     `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4, N): forces in
     free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force biases
-    that free motion shows and the rig does not admit, `doubt`: the like of the pads; `level_rises`: by
+    that free motion shows and the rig does not admit, `doubts`: the like of the pads; `level_rises`: by
     move between equal heights, the mean rise that was recorded [m]; `moved` (4,): by how much the zeros
     of forces move within a trial [N].
     """
@@ -512,7 +508,9 @@ class Design:
     scale_count: np.ndarray
     slope_sd: np.ndarray = field(default_factory=lambda: np.full(len(CHANNELS), SLOPE_SD))
     unexpected: tuple[Nuisance, ...] = ()
-    doubt: PadDoubt = field(default_factory=PadDoubt)
+    doubts: Mapping[str, PadDoubt] = field(
+        default_factory=lambda: {"normal": PadDoubt(), "shear": PadDoubt()}
+    )
     level_rises: dict[int, float] = field(default_factory=dict)
     moved: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
@@ -527,13 +525,8 @@ class Design:
         return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
 
-def build(
-    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise, doubted: bool | None = None
-) -> Design:
-    """Design of aligned trials, `weighed` by `estimation.observations`.
-
-    `doubted`: whether the rig's pads are in doubt by what slopes say against them; None: if that is likelier.
-    """
+def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise) -> Design:
+    """Design of aligned trials, `weighed` by `estimation.observations`."""
     task, rig, trials = aligned.task, aligned.rig, [one.trial for one in aligned.trials]
     moves = list(range(len(task.performed)))
     objects = [task.performed[m].object for m in moves]
@@ -560,10 +553,10 @@ def build(
     slope_variance, alike = (
         np.stack(each) for each in zip(*(slope_variances(a, moves) for a in weighed), strict=True)
     )
-    doubt = pad_doubt(slopes, slope_variance, alike, weighed, rig)
-    doubt = replace(doubt, doubted=max(doubt.odds) > 0.5 if doubted is None else doubted)
-    slope_variance += doubt.slope_sd()[sloped] ** 2
-    deviations = nuisances(rig, surprise, doubt, max(trial.touch_sd for trial in trials))
+    doubts = pad_doubts(slopes, slope_variance, alike, weighed, rig)
+    slope_sd = np.array([SLOPE_SD, *(doubt.slope_sd for doubt in doubts.values())])
+    slope_variance += slope_sd[sloped] ** 2
+    deviations = nuisances(rig, surprise, doubts, max(trial.touch_sd for trial in trials))
     surprising = {f"force_bias.{name}" for name, sd in zip(FORCE_CHANNELS, surprise, strict=True) if sd}
     shifts = np.zeros((*there.shape, len(deviations)))
     slope_shifts = np.zeros((*slopes.shape, len(deviations)))
@@ -588,9 +581,9 @@ def build(
         trial=np.concatenate([where[0], steep[0]]), move=np.concatenate([where[1], steep[1]]),
         slope=np.repeat([False, True], [where[0].size, steep[0].size]),
         free_mean=free_mean, free_variance=free_variance, free_shifts=free_shifts,
-        scale_count=np.array(counts), slope_sd=doubt.slope_sd(),
+        scale_count=np.array(counts), slope_sd=slope_sd,
         unexpected=tuple(d for d in deviations if d.name in surprising), moved=moved,
-        doubt=doubt, level_rises=level_rises(raw, rises),
+        doubts=doubts, level_rises=level_rises(raw, rises),
     )  # fmt: skip
 
 

@@ -264,7 +264,7 @@ BINS_PER_SD = 3.0  # numerics: bins of G to the smallest noise
 MAX_BINS = 300  # numerics: of G at most: its cost is linear in them
 GLITCH = 0.01  # prior: share of samples that say nothing: a bound must rest on more than one
 BURN_IN, SWEEPS = 20, 48  # numerics: of Gibbs sampling: left out, and kept
-CORROBORATING = 8  # chosen: samples of which surely not all are glitches
+CORROBORATING = int(np.ceil(np.log(np.finfo(float).eps) / np.log(GLITCH)))  # of which not all are glitches
 REACH = 5.0  # numerics: standard deviations beyond which a sample cannot be the largest
 
 

@@ -20,20 +20,13 @@ from estimation.checks import (
     unstated_pads,
 )
 from estimation.consistency import contradictions, force_scale
-from estimation.design import Design, Unknown
+from estimation.design import Design, Unknown, build
 from estimation.friction import FrictionPosterior, friction_posteriors
 from estimation.observations import Noise, WeighedTrial, aligned_weights
+from estimation.posterior import posterior
 from estimation.report import Actual, inference_data, properties_table, summary
-from estimation.sampler import Draws, designs, sample_either
-from hmmseg.contact.decompose import (
-    ABOVE_GROUND,
-    FREE,
-    ON_GROUND,
-    UNITS,
-    Subtask,
-    decompose,
-    height_equations,
-)
+from estimation.sampler import Draws, sample
+from hmmseg.contact.decompose import UNITS, Decomposition, decompose
 from hmmseg.errors import nearest
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
@@ -100,14 +93,14 @@ class Identification(Tabled):
 
     def to_json(self) -> dict:
         """The body of `identify`'s JSON document."""
-        properties, found = dict[str, dict](), self.sampled
+        properties, found, described = dict[str, dict](), self.sampled, decompose(self.task)
         for obj in self.task.objects:
             entry: dict = {}
             for prop, unit in UNITS.items():
                 known = (obj, prop) in self.names
                 entry[prop] = summary(self.of(obj, prop), unit) if known else None
                 if known:
-                    entry[prop]["subtasks"] = source_subtasks(self.aligned.subtasks, self.task, obj, prop)
+                    entry[prop]["subtasks"] = source_subtasks(described, obj, prop)
             friction = self.friction.get(obj)
             entry["friction"] = None if friction is None else friction.to_json()
             properties[obj] = entry
@@ -174,7 +167,7 @@ def identify_aligned(
     trials = [one.trial for one in aligned.trials]
     weighed, noise = aligned_weights(aligned, rng)
     sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
-    design, other = designs(aligned, weighed, noise)
+    design = build(aligned, weighed, noise)
     friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng)
     hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
     if "friction" in hidden:
@@ -186,7 +179,8 @@ def identify_aligned(
     kept: list[int] = []
     contradicted: dict[str, str] = {}
     if design.unknowns:
-        found, sampled = sample_either(design, other, seed, progress)
+        found = posterior(design)
+        sampled = sample(found, seed, progress)
         if sampled.converged:
             predictive = check(found, sampled, rng)
             warnings += predictive.warnings
@@ -194,7 +188,7 @@ def identify_aligned(
             contradicted = contradictions(aligned, weighed, design)
             reasons |= contradicted | impossible(design, sampled)
             kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
-            scale = None if aligned.late else force_scale(design.doubt, weighed, rig)
+            scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
         if not sampled.converged:
             why = f"the sampler has not converged: {sampled.shortfall}"
             warnings.append(why)
@@ -245,18 +239,10 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
     return out
 
 
-def source_subtasks(steps: tuple[Subtask, ...], task: BlockTask, obj: str, prop: str) -> list[str]:
+def source_subtasks(described: Decomposition, obj: str, prop: str) -> list[str]:
     """Names of the subtasks whose samples determine this property, as `carry block1`."""
-    rises = dict(height_equations(task))
-
-    def tells(s: Subtask) -> bool:
-        if prop == "height":
-            return s.state == ON_GROUND and s.move is not None and rises[s.move].get(obj, 0) != 0
-        if s.object != obj:
-            return False
-        return s.state == ABOVE_GROUND if prop == "weight" else s.state != FREE
-
-    return list(dict.fromkeys(s.label for s in steps if tells(s)))
+    evidence = described.properties[obj][prop].evidence
+    return list(dict.fromkeys(described.subtasks[k].label for one in evidence for k in one.subtasks))
 
 
 def _reasons(
@@ -270,15 +256,15 @@ def _reasons(
             if (obj, prop) in design.names:
                 continue
             reason = described.properties[obj][prop].reason
-            out[f"{obj}.{prop}"] = reason or _not_recorded(aligned, obj, prop)
+            needed = source_subtasks(described, obj, prop)
+            out[f"{obj}.{prop}"] = reason or _not_recorded(aligned, obj, needed)
         known = friction.get(obj)
         if known is None or known.lower_bound is None:
             out[f"{obj}.friction"] = known.reason if known else f"{obj} is never held"
     return out
 
 
-def _not_recorded(aligned: AlignedTrials, obj: str, prop: str) -> str:
-    needed = source_subtasks(aligned.subtasks, aligned.task, obj, prop)
+def _not_recorded(aligned: AlignedTrials, obj: str, needed: list[str]) -> str:
     if not needed:
         return f"no subtask of this task lifts {obj}"
     missing = f"the recording does not show {' and '.join(needed)} as the task has it"

@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
@@ -28,54 +29,10 @@ from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import StateLabels, label_states
 
-TRIM = 0.05  # chosen: share of the carry left out at either end of the weight estimate
+TRIM = 0.05  # cited: share of the carry left out at either end of the weight estimate, by the paper
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A property: mean, standard deviation over samples and standard error of the mean."""
-
-    unit: str
-    mean: float
-    sd: float
-    standard_error: float
-    subtasks: tuple[str, ...]
-
-    def to_json(self) -> dict:
-        """Entry of `properties`; the intervals are normal ones of the mean's standard error."""
-        document: dict = {"unit": self.unit, "mean": self.mean, "sd": self.sd, "median": self.mean}
-        document["standard_error"] = self.standard_error
-        for percent in (68, 95):
-            half = float(ndtri(0.5 + percent / 200)) * self.standard_error
-            document[f"interval_{percent}"] = [self.mean - half, self.mean + half]
-        return {**document, "subtasks": list(self.subtasks)}
-
-
-@dataclass(frozen=True)
-class FrictionBound:
-    """Lower bound of the friction coefficient between fingers and object."""
-
-    lower_bound: float
-    subtasks: tuple[str, ...]
-
-    def to_json(self) -> dict:
-        """Entry of `properties`."""
-        return {"unit": "1", "lower_bound": self.lower_bound, "subtasks": list(self.subtasks)}
-
-
-@dataclass(frozen=True)
-class PluginEstimates:
-    """Per object and property an estimate, or None with the reason under "object.property"."""
-
-    properties: dict[str, dict[str, Estimate | FrictionBound | None]]
-    reasons: dict[str, str]
-
-    def to_json(self) -> dict:
-        """The `properties` and `reasons` of the JSON of `identify`."""
-        shown = {name: {key: None if value is None else value.to_json() for key, value in entry.items()}
-                 for name, entry in self.properties.items()}  # fmt: skip
-        return {"properties": shown, "reasons": dict(self.reasons)}
-
+Properties = dict[str, dict[str, dict[str, Any] | None]]  # by object and property, as in identify's JSON
 
 # A mean over samples, their standard deviation and the mean's standard error (3,), and of which subtasks.
 Found = tuple[np.ndarray, list[str]]
@@ -112,7 +69,7 @@ def estimate_plugin(
     segmentations: Sequence[Segmentation],
     task: BlockTask,
     states: Sequence[StateLabels] | None = None,
-) -> PluginEstimates:
+) -> tuple[Properties, dict[str, str]]:
     """The paper's estimates of every object of a task from its segmented trials.
 
     Args:
@@ -122,7 +79,8 @@ def estimate_plugin(
         states: contact states of each trial's samples; by default those of the paper's thresholds.
 
     Returns:
-        Mean and standard deviation of every property, or why it has none.
+        Every property's entry in identify's JSON, with its `standard_error`, of which intervals are the
+        normal ones; and why those without have none, by `object.property`.
 
     Raises:
         ValueError: the sequences differ in length.
@@ -135,7 +93,7 @@ def estimate_plugin(
         for signals, segmentation, label in zip(trials_signals, segmentations, labels, strict=True)
     ]
     heights, known = _heights(trials, task, steps), decompose(task).properties
-    properties: dict[str, dict[str, Estimate | FrictionBound | None]] = {}
+    properties: Properties = {}
     reasons: dict[str, str] = {}
     for name in task.objects:
         grips = [s for s in steps if s.state != FREE and s.object == name]
@@ -151,7 +109,7 @@ def estimate_plugin(
             if key in ("weight", "width") and not carries:
                 shown = f"no move carries {name}, and the formula averages over a carry"
             reasons[f"{name}.{key}"] = known[name][key].reason or shown
-    return PluginEstimates(properties, reasons)
+    return properties, reasons
 
 
 def _as_performed(task: BlockTask, segmentations: Sequence[Segmentation]) -> BlockTask:
@@ -181,14 +139,18 @@ def _means(trials: Sequence[_Trial], steps: Sequence[Subtask], name: str, trim: 
     return [(mean, labels) for mean, labels in found if mean is not None]
 
 
-def _pooled(key: str, found: Sequence[Found]) -> Estimate | None:
+def _pooled(key: str, found: Sequence[Found]) -> dict[str, Any] | None:
     """Mean over the means, each with the same weight."""
     if not found:
         return None
-    mean, sd, error = np.array([each for each, _ in found]).T
-    names = dict.fromkeys(label for _, labels in found for label in labels)
-    return Estimate(UNITS[key], float(mean.mean()), math.sqrt(np.mean(sd**2)),
-                    math.sqrt(np.sum(error**2)) / len(found), tuple(names))  # fmt: skip
+    means, sds, errors = np.array([each for each, _ in found]).T
+    mean, error = float(means.mean()), math.sqrt(np.sum(errors**2)) / len(found)
+    out = {"unit": UNITS[key], "mean": mean, "sd": math.sqrt(np.mean(sds**2)), "median": mean}
+    for percent in (68, 95):
+        half = float(ndtri(0.5 + percent / 200)) * error
+        out[f"interval_{percent}"] = [mean - half, mean + half]
+    labels = dict.fromkeys(label for _, labels in found for label in labels)
+    return out | {"standard_error": error, "subtasks": list(labels)}
 
 
 def _heights(trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ...]) -> dict[str, list[Found]]:
@@ -218,7 +180,7 @@ def _heights(trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ..
     return found
 
 
-def _friction(trials: Sequence[_Trial], grips: Sequence[Subtask]) -> FrictionBound | None:
+def _friction(trials: Sequence[_Trial], grips: Sequence[Subtask]) -> dict[str, Any] | None:
     """The largest ratio that any grip shows."""
     shown = []
     for trial in trials:
@@ -229,4 +191,5 @@ def _friction(trials: Sequence[_Trial], grips: Sequence[Subtask]) -> FrictionBou
             shown += [(float(inside.max()), step.label)] if inside.size else []
     if not shown:
         return None
-    return FrictionBound(max(ratio for ratio, _ in shown), tuple(dict.fromkeys(label for _, label in shown)))
+    labels = list(dict.fromkeys(label for _, label in shown))
+    return {"unit": "1", "lower_bound": max(ratio for ratio, _ in shown), "subtasks": labels}

@@ -14,7 +14,7 @@ from hmmseg.contact import decompose
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
 from hmmseg.levels import SURE
-from hmmseg.numbers import SHOWN, estimate, interval, plain
+from hmmseg.numbers import SHOWN, estimate, fixed, interval, plain
 from hmmseg.tables import listed
 
 INTERVALS = {"interval_68": (16.0, 84.0), "interval_95": (2.5, 97.5)}  # physics: a definition: percentiles
@@ -144,27 +144,40 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
     return float(value)
 
 
-def properties_table(body: dict[str, Any], measured=None) -> Table:
-    """The properties for people to read, lengths in cm as the paper has them."""
+def property_rows(body: dict[str, Any], measured: Actual | None = None) -> list[dict[str, str]]:
+    """Of every property in words: `estimate`, its intervals, what was `measured`, by how many per cent the
+    estimate is off that, and the subtasks that it is `from`, or why it is unknown."""
     rows = []
-    for obj, entries in body["properties"].items():
-        for prop, entry in entries.items():
-            shown = SHOWN[prop]
-            cells = [obj, prop, "unknown", ""]
-            if entry is not None and entry.get("mean") is None:
-                cells[2] = f">= {plain(entry['lower_bound'])}"
-            elif entry is not None:
-                cells[2:] = (
-                    estimate(entry["mean"], entry["sd"], shown),
-                    interval(entry["interval_95"][0], entry["interval_95"][1], shown, 2 * 1.96),
-                )
-            if measured:
-                value = measured.get(obj, {}).get(prop)
-                against = body.get("actual", {}).get(obj, {}).get(prop, {})
-                mark = "  disagrees" if against.get("disagrees") else ""
-                cells.append("" if value is None else f"{estimate(value[0], value[1], shown)}{mark}")
-            rows.append(cells)
-    heads = ["block", "property", "estimate", "95 % interval", *(("measured",) if measured else ())]
+    for obj, prop, entry in ((o, p, e) for o, own in body["properties"].items() for p, e in own.items()):
+        shown, compared = SHOWN[prop], body.get("actual", {}).get(obj, {}).get(prop, {})
+        row = dict.fromkeys(("estimate", *INTERVALS, "measured", "deviation", "from"), "")
+        row |= {"block": obj, "property": prop, "estimate": "unknown"}
+        if entry is None:
+            row["from"] = body["reasons"].get(f"{obj}.{prop}", "")
+        else:
+            row["from"] = ", ".join(entry.get("subtasks", ()))
+            row["estimate"] = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
+        if measured and (value := measured.get(obj, {}).get(prop)) is not None:
+            row["measured"] = estimate(*value, shown)
+            if entry is not None and entry.get("mean") is not None:
+                row["deviation"] = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"
+            if compared.get("disagrees"):
+                row["deviation"] += ", disagrees" if row["deviation"] else "disagrees"
+        if entry is not None and entry.get("mean") is not None:
+            row["estimate"] = estimate(entry["mean"], entry["sd"], shown)
+            row["interval_68"], row["interval_95"] = (
+                interval(entry[name][0], entry[name][1], shown, sds)
+                for name, sds in zip(INTERVALS, (2.0, 3.9), strict=True)
+            )
+        rows.append(row)
+    return rows
+
+
+def properties_table(body: dict[str, Any], measured: Actual | None = None) -> Table:
+    """The properties for people to read, lengths in cm as the paper has them."""
+    keys = ["block", "property", "estimate", "interval_95", *(("measured", "deviation") if measured else ())]
+    heads = ["95 % interval" if key == "interval_95" else key for key in keys]
+    rows = [[row[key] for key in keys] for row in property_rows(body, measured)]
     return listed(f"properties ({body['method']})", heads, rows)
 
 

@@ -4,26 +4,18 @@ All else is integrated out (`estimation.posterior`), so emcee moves in six dimen
 task. Most proposals are independent draws (`Proposal`), the rest differential evolution (ter Braak 2006),
 which frees walkers that it would hold in a tail. benchmarks/moves.py of commit f82105c compares them with
 emcee's stretch move.
-
-Slopes within a grip may contradict `[fingertip]` without proving it wrong (`estimation.pads.misstated`). One
-design then believes the rig, another doubts it by as much as the slopes say; widths are drawn from the
-latter with the probability that the pads' give along the grip is wrong, heights with that of their shear.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import gammaln
 
 from estimation import priors
-from estimation.design import DISTANCE, RISE, Design, PadDoubt, build
-from estimation.observations import Noise, WeighedTrial
-from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode, posterior
-from hmmseg.levels import CERTAIN
-from hmmseg.segmentation.align import AlignedTrials
+from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode
 from hmmseg.tables import Brief
 
 TAIL = 5.0  # numerics: degrees of freedom for the noise: proposals need heavier tails than the posterior
@@ -252,47 +244,3 @@ def split_rhat(chain: np.ndarray) -> float:
     within = parts.var(axis=1, ddof=1).mean(axis=0)
     between = parts.mean(axis=1).var(axis=0, ddof=1)
     return float(np.sqrt(np.max(1 + between / within)))
-
-
-def designs(
-    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise
-) -> tuple[Design, Design | None]:
-    """The likelier design, and the other one where it is open whether the rig's pads are right."""
-    found = build(aligned, weighed, noise)
-    if not found.unknowns or not any(0 < odds < CERTAIN for odds in found.doubt.odds):
-        return found, None
-    return found, build(aligned, weighed, noise, not found.doubt.doubted)
-
-
-def sample_either(
-    likelier: Design, other: Design | None, seed: int = 0, progress: Callable[[int, int], None] | None = None
-) -> tuple[Posterior, Draws]:
-    """The likelier design's posterior and draws of its unknowns, mixed with the other's by their odds.
-
-    Scales, shares and deviations stay those of the likelier; the other is left out if it does not converge.
-    """
-    first = posterior(likelier)
-    found = sample(first, seed, progress)
-    if other is None or not found.converged:
-        return first, found
-    second = sample(posterior(other), seed)
-    return first, found if not second.converged else mixed(
-        found, second, [u.prop for u in likelier.unknowns], likelier.doubt, seed
-    )
-
-
-def mixed(likelier: Draws, other: Draws, props: Sequence[str], doubt: PadDoubt, seed: int) -> Draws:
-    """Draws of the likelier, those of each channel replaced by the other's with its probability.
-
-    `props`: of the unknowns; `doubt`: the likelier's.
-    """
-    rng, chain = np.random.default_rng([seed, 17]), likelier.chain.copy()
-    flat = chain.reshape(-1, chain.shape[-1])
-    instead = other.flat[rng.integers(len(other.flat), size=len(flat))]
-    for channel, odds in zip((DISTANCE, RISE), doubt.odds, strict=True):
-        wrong = 1.0 if odds >= CERTAIN else odds
-        swapped = rng.uniform(size=len(flat)) < (1 - wrong if doubt.doubted else wrong)
-        mine = np.array([priors.CHANNEL[prop] == channel for prop in props])
-        taken = swapped[:, None] & mine
-        flat[taken] = instead[taken]
-    return replace(likelier, chain=flat.reshape(chain.shape))

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from estimation.design import PROPERTIES
+from estimation.design import PROPERTIES, build
 from estimation.observations import aligned_weights
 from estimation.posterior import find_mode, posterior
-from estimation.sampler import designs, sample_either
+from estimation.sampler import sample
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
 from experiments.scoring import boundaries_covered, boundary_residuals
@@ -69,13 +69,14 @@ def estimate(case: Case, trials: slice = slice(None), seed: int = 0) -> Estimate
     pairs = list(zip(segmentations, truth, strict=True))
     rng = np.random.default_rng(seed)
     weighed, noise = aligned_weights(aligned, rng)
-    design, other = designs(aligned, weighed, noise)
-    mode = find_mode(posterior(design))
+    design = build(aligned, weighed, noise)
+    post = posterior(design)
+    mode = find_mode(post)
     single = [i for i, u in enumerate(design.unknowns) if u.single]
     names = tuple(design.names[i] for i in single)
     true = np.array([case.blocks[obj][prop][0] for obj, prop in names])
     z = (mode.unknowns[single] - true) / np.sqrt(np.diag(mode.unknowns_covariance))[single]
-    _, found = sample_either(design, other, seed)
+    found = sample(post, seed, mode=mode)
     draws = found.flat[:, single]
     return Estimates(
         np.array([boundary_residuals(s, t) for s, t in pairs]),

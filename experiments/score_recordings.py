@@ -75,7 +75,7 @@ def by_thresholds(order: Order) -> Method:
     def run(case: Case, group: slice, seed: int) -> tuple[Sequence[Segmentation], dict]:
         pairs = zip(case.trials[group], case.signals[group], strict=True)
         spans = [segment_qualitative(trial, signals, case.task, order=order) for trial, signals in pairs]
-        return spans, estimate_plugin(case.signals[group], spans, case.task).to_json()["properties"]
+        return spans, estimate_plugin(case.signals[group], spans, case.task)[0]
 
     return run
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -187,19 +188,12 @@ def _draw(
         return
     from hmmseg.contact.decompose import subtasks
     from hmmseg_cli.pages import Setting, page
-    from simgap.report.figures import draw_all, draw_how_far, draw_signal
+    from simgap.report.figures import draw_all
 
-    body, names = found.body, list(dict.fromkeys(s.label for s in subtasks(task)))
-
-    def draw(path: Callable[[str], Path]) -> None:
-        draw_signal(found, path("gap_signal.png"))
-        if body.get("shrinkage") and body["shrinkage"].get("before") is not None:
-            draw_how_far(body, path("gap_before_after.png"))
-
+    draw = partial(draw_all, found, list(dict.fromkeys(s.label for s in subtasks(task))))
     if out.figures is not None:
-        draw_all(body, names, out.figure)
-        draw_signal(found, out.figure("gap_signal.png"))
+        draw(out.figure)
     if out.report is not None:
         shows = {name: candidate.shows for name, candidate in candidates.items()}
-        setting = Setting(files, names, pads or {}, measured, shows, out.warnings)
-        out.stage(out.report).write_text(page(body, setting, draw), encoding="utf-8")
+        setting = Setting(files, pads or {}, measured, shows, out.warnings)
+        out.stage(out.report).write_text(page(found.body, setting, draw), encoding="utf-8")

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -220,7 +221,6 @@ def _deliver(
 ) -> None:  # fmt: skip
     """History, the motion to run next, courses for Rerun, figures and the page."""
     from simgap.report import robot
-    from simgap.robots.changes import Changes
 
     units = robot.own_units(loaded)
     if own.history is not None:
@@ -249,21 +249,20 @@ def _deliver(
         robot.write_rerun(out.stage(own.rerun), robot.courses(found, units))
     if out.figures is None and out.report is None:
         return
-    from simgap.report.figures import draw_robot, draw_robot_page
+    from simgap.report.figures import draw_robot
 
+    draw = partial(draw_robot, found, document, units)
     if out.figures is not None:
-        draw_robot(found, document, units, out.figure)
+        draw(out.figure)
     if out.report is not None:
         from hmmseg_cli.pages import Setting, page
 
-        phases = ["all"] if isinstance(found, Changes) else sorted({c["subtask"] for c in document["where"]})
         shows = {n: e.says for n, e in effects.items()}
         setting = Setting(
-            [log.name for log in logs], phases, shows=shows, warnings=out.warnings, own=units,
+            [log.name for log in logs], shows=shows, warnings=out.warnings, own=units,
             motion="" if place is None else os.path.relpath(place, out.report.parent),
         )  # fmt: skip
-        text = page(document, setting, lambda path: draw_robot_page(found, units, path))
-        out.stage(out.report).write_text(text, encoding="utf-8")
+        out.stage(out.report).write_text(page(document, setting, draw), encoding="utf-8")
 
 
 def _history(said: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:

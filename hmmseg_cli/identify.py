@@ -85,8 +85,9 @@ def _paper(
     pairs = zip(recordings, signals, strict=True)
     segmentations = [segment_qualitative(trial, s, task) for trial, s in pairs]
     warn_of_misfits(out, segmentations)
+    properties, reasons = estimate_plugin(signals, segmentations, task)
     body = {"trials": [s.to_json() for s in segmentations], "method": "paper", "sampler": None}
-    return body | estimate_plugin(signals, segmentations, task).to_json(), segmentations
+    return body | {"properties": properties, "reasons": reasons}, segmentations
 
 
 def _bayes(out: Output, recordings: Sequence[Trial], task: BlockTask, hand: Rig) -> Identification:

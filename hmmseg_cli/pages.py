@@ -14,13 +14,12 @@ import jinja2
 import hmmseg
 from estimation.identification import Identification
 from estimation.plots import draw_check, draw_corner, draw_estimates
-from estimation.report import Actual
+from estimation.report import INTERVALS, Actual, property_rows
 from hmmseg.io.trial import Trial
 from hmmseg.numbers import (
     SHOWN,
     between,
     estimate,
-    fixed,
     interval,
     percent,
     plain,
@@ -91,10 +90,13 @@ def identification_page(
          estimate(check["scatter_between_grips"], 0, shown_as("N" if name == "force" else "m")))
         for name, check in (body.get("predictive") or {}).items()
     ]  # fmt: skip
+    apart = ("measured", "deviation") if measured is not None else ()
+    keys = ("block", "property", "estimate", *INTERVALS, *apart, "from")
     return rendered(
         "identify.html.j2", method=body["method"], objects=list(body["properties"]),
         verdict=[_verdict(obj, entry) for obj, entry in body["properties"].items()],
-        warnings=warnings, measured=measured is not None, rows=_rows(body, measured), figures=figures,
+        warnings=warnings, measured=measured is not None, figures=figures,
+        rows=[[row[key] for key in keys] for row in property_rows(body, measured)],
         trials=shown, sampler=body["sampler"], predictive=checks, notes=body.get("notes", ()),
     )  # fmt: skip
 
@@ -112,29 +114,6 @@ def _verdict(obj: str, entry: dict[str, Any]) -> str:
     return f"{obj} {', '.join(parts)}." if parts else f"Nothing could be determined of {obj}."
 
 
-def _rows(body: dict[str, Any], measured: Actual | None) -> list[tuple[str, ...]]:
-    """Block, property, estimate, intervals, what was measured and the deviation from it, source."""
-    rows = []
-    for name, entry in ((f"{o}.{p}", e) for o, own in body["properties"].items() for p, e in own.items()):
-        obj, _, prop = name.rpartition(".")
-        value, shown = (measured or {}).get(obj, {}).get(prop), SHOWN[prop]
-        source, text, inner, outer, deviation = body["reasons"].get(name, ""), "unknown", "", "", ""
-        if entry is not None:
-            source = ", ".join(entry.get("subtasks", ()))
-            text = f"≥ {plain(entry['lower_bound'])}" if "lower_bound" in entry else ""
-        if entry is not None and entry.get("mean") is not None:
-            text = estimate(entry["mean"], entry["sd"], shown)
-            inner = interval(*entry["interval_68"], shown=shown, sds=2.0)
-            outer = interval(*entry["interval_95"], shown=shown, sds=3.9)
-            if value is not None:
-                compared = body.get("actual", {}).get(obj, {}).get(prop, {})
-                deviation = f"{fixed(100 * (entry['mean'] / value[0] - 1), 2, '+')} %"
-                deviation += ", disagrees" if compared.get("disagrees") else ""
-        apart = ("" if value is None else estimate(*value, shown), deviation) if measured else ()
-        rows.append((obj, prop, text, inner, outer, *apart, source))
-    return rows
-
-
 Body = Mapping[str, Any]
 MOST = 8  # look: rows of a table
 NOTHING = 5e-3  # look: probability, or share of a gap, that is shown as none
@@ -143,13 +122,12 @@ SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a page shows apart from the body: recordings, subtasks in order, the rig's pads, measured values,
+    """What a page shows apart from the body: recordings, the rig's pads, measured values,
     how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there,
     and where the motion to run next is.
     """
 
     files: Sequence[str]
-    subtasks: Sequence[str]
     rig: Mapping[str, Any] = field(default_factory=dict)
     measured: Mapping[str, Mapping[str, tuple[float, float]]] | None = None
     shows: Mapping[str, str] = field(default_factory=dict)
@@ -172,11 +150,9 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         to_do=to_do if body["verdict"] != "none" else [],
         remains=finding.remains(body),
         parameters=_parameters(effect, body["causes"], setting) if effect and body["causes"] else [],
-        subtasks=setting.subtasks,
-        heat=_heat(cells, setting.subtasks) if cells else [],
         where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
         more_cells=max(len(cells) - MOST, 0),
-        images=images | {n: None for n in ("gap_signal", "gap_before_after") if n not in images},
+        images=dict.fromkeys(("gap_where", "gap_signal", "gap_before_after")) | images,
         suspects=_suspects(body, setting),
         attributed=bool(body.get("attribution")),
         robot=finding.of_robot(body),
@@ -191,25 +167,6 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         warnings=setting.warnings,
         files=setting.files,
     )
-
-
-def _heat(cells: Mapping[tuple[str, str], Sequence], subtasks: Sequence[str]) -> list[dict[str, Any]]:
-    channels = [c for c in finding.CHANNELS if any(k[0] == c for k in cells)]
-    channels += sorted({k[0] for k in cells} - set(channels))
-    top = max(finding.share_of(found) for found in cells.values())
-    out = []
-    for channel in channels:
-        row = [cells.get((channel, subtask)) for subtask in subtasks]
-        shown = [_coloured(finding.share_of(found), top) if found else None for found in row]
-        out.append({"name": channel, "cells": shown})
-    return out
-
-
-def _coloured(share: float, top: float) -> dict[str, str]:
-    depth = (share / top) ** 0.5 if top > 0 else 0.0
-    light = 94 - 50 * depth
-    text = "<1" if share < 0.005 else f"{100 * share:.0f}"
-    return {"colour": f"hsl(24 90% {light:.0f}%)", "ink": "#fff" if light < 58 else "#3a1d00", "text": text}
 
 
 def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:

@@ -12,11 +12,11 @@ import numpy as np
 from estimation import identify
 from estimation.identification import Identification, source_subtasks
 from estimation.observations import draw_boundaries
-from estimation.paper_formulas import FrictionBound, estimate_plugin
+from estimation.paper_formulas import estimate_plugin
 from estimation.priors import property_priors
 from experiments.paper.sources import BLOCKS, ONE, PRINTED, qualitative, recorded, save, simulated
 from experiments.recordings import Case
-from hmmseg.contact.decompose import subtasks
+from hmmseg.contact.decompose import decompose
 
 KEYS = ("weight", "height", "width")
 PROPERTIES = (("block1", "weight"), ("block2", "height"), ("block1", "width"), ("block1", "friction"))
@@ -39,42 +39,37 @@ def identified(case: Case, index: int | None = None) -> Identification:
 def table_3() -> list[dict]:
     """Per property of block 1's move: the subtasks that the paper's formulas and ours draw on."""
     case = recorded()
-    paper = estimate_plugin(case.signals, qualitative(case), case.task).properties
+    paper, _ = estimate_plugin(case.signals, qualitative(case), case.task)
     ours = identified(case).to_json()["properties"]
     rows = []
     for name, key in PROPERTIES:
         used = (ours[name][key] or {}).get("subtasks") or held(case, name)
         found = paper[name][key]
-        rows.append({"object": name, "property": key, "paper": list(found.subtasks), "bayes": used})
+        rows.append({"object": name, "property": key, "paper": found["subtasks"], "bayes": used})
     return rows
 
 
 def held(case: Case, name: str) -> list[str]:
     """Subtasks in which a block is held: all of them bear on its friction."""
-    return source_subtasks(subtasks(case.task), case.task, name, "width")
+    return source_subtasks(decompose(case.task), name, "width")
 
 
 def by_formula(case: Case) -> dict:
     """The paper's estimates: of the one trial with sd over samples, of all with sd between trials."""
     found = qualitative(case)
-    each = [estimate_plugin([s], [f], case.task).properties
+    each = [estimate_plugin([s], [f], case.task)[0]
             for s, f in zip(case.signals, found, strict=True)]  # fmt: skip
     out: dict = {"one": {}, "all": {}}
     for name in BLOCKS:
         out["one"][name], out["all"][name] = {}, {}
         for key in KEYS:
-            one, means = each[ONE][name][key], [trial[name][key].mean for trial in each]
-            out["one"][name][key] = {"mean": one.mean, "sd": one.sd}
+            one, means = each[ONE][name][key], [trial[name][key]["mean"] for trial in each]
+            out["one"][name][key] = {"mean": one["mean"], "sd": one["sd"]}
             out["all"][name][key] = {"mean": np.mean(means), "sd": np.std(means, ddof=1)}
-        bounds = [trial[name]["friction"] for trial in each]
-        out["one"][name]["friction"] = _bound(bounds[ONE])
-        out["all"][name]["friction"] = max(map(_bound, bounds))
+        bounds = [trial[name]["friction"]["lower_bound"] for trial in each]
+        out["one"][name]["friction"] = bounds[ONE]
+        out["all"][name]["friction"] = max(bounds)
     return out
-
-
-def _bound(value) -> float:
-    assert isinstance(value, FrictionBound)
-    return value.lower_bound
 
 
 def by_posterior(found: Identification) -> dict:

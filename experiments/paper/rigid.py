@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimation import identify
-from estimation.paper_formulas import PluginEstimates, estimate_plugin
+from estimation.paper_formulas import Properties, estimate_plugin
 from experiments.paper.estimates import identified
 from experiments.paper.sources import BLOCKS, PRINTED, qualitative, recorded, save, simulated
 from experiments.recordings import Case
@@ -37,19 +37,19 @@ def without_pads(signals: Signals, rig: Rig) -> Signals:
     return replace(signals, **moved)
 
 
-def by_formula(case: Case, index: int, compliant: bool) -> PluginEstimates:
+def by_formula(case: Case, index: int, compliant: bool) -> Properties:
     """The paper's formulas on one trial, pads rigid or taken out first."""
     signals, found = case.signals[index], qualitative(case)[index]
     labels = label_states(signals)
     return estimate_plugin([without_pads(signals, case.rig) if compliant else signals], [found],
-                           case.task, [labels])  # fmt: skip
+                           case.task, [labels])[0]  # fmt: skip
 
 
 def shortfalls(case: Case) -> list[dict]:
     """Per trial and block: grip [N], width [m] short with rigid pads, what 2 N / k predicts, what remains."""
     rows = []
     for i, (signals, found) in enumerate(zip(case.signals, qualitative(case), strict=True)):
-        rigid, compliant = (by_formula(case, i, flag).properties for flag in (False, True))
+        rigid, compliant = (by_formula(case, i, flag) for flag in (False, True))
         held = label_states(signals).state > 1
         for name in BLOCKS:
             span = next(s for s in found.spans if (s.subtask, s.object) == ("carry", name))
@@ -58,9 +58,9 @@ def shortfalls(case: Case) -> list[dict]:
             width = case.blocks[name]["width"][0]
             rows.append({
                 "file": case.trials[i].name, "object": name, "grip": squeeze / 2,
-                "short": width - rigid[name]["width"].mean,
+                "short": width - rigid[name]["width"]["mean"],
                 "predicted": squeeze / case.rig.fingertip.normal_stiffness,
-                "remaining": compliant[name]["width"].mean - width,
+                "remaining": compliant[name]["width"]["mean"] - width,
             })  # fmt: skip
     return rows
 

@@ -110,8 +110,8 @@ def _measured(rig: Rig, friction: float, t: np.ndarray, tips: np.ndarray, veloci
     trial = record(t[k], tips[k], velocity[k], np.asarray(motion.force)[k], rig, None, "stacked")
     signals = task_space(trial, rig)
     found = segment_qualitative(trial, signals, STACK)
-    height = estimate_plugin([signals], [found], STACK).properties["block1"]["height"]
-    residual = height.mean - PAPER_BLOCKS["block1"].height if height is not None else np.nan
+    height = estimate_plugin([signals], [found], STACK)[0]["block1"]["height"]
+    residual = height["mean"] - PAPER_BLOCKS["block1"].height if height is not None else np.nan
     spans = {span.subtask: span for span in found.spans}
     ends = [_mean(t, slid, spans[name]) for name in ("pickup", "place")] if found.complete else [np.nan] * 2
     return Placed(friction, ends[1] - ends[0], residual, t[k], slid[k], tips[k, 1, 1])
@@ -132,11 +132,11 @@ def performed(case: Case) -> list[dict]:
         for one in simulate_trials(case.task, case.rig, [blocks] * 10, list(range(10))):
             signals = task_space(one.trial, case.rig)
             found = segment_qualitative(one.trial, signals, case.task)
-            properties = estimate_plugin([signals], [found], case.task).properties
+            properties, _ = estimate_plugin([signals], [found], case.task)
             for beneath, move, sign in (("block2", 0, -1), ("block1", 1, 1)):
                 height, slip = properties[beneath]["height"], _slip(one, case, move)
                 if height is not None and np.isfinite(slip):
-                    residual = height.mean - PAPER_BLOCKS[beneath].height
+                    residual = height["mean"] - PAPER_BLOCKS[beneath].height
                     rows.append({"friction": friction, "height_of": beneath, "slip": sign * slip,
                                  "residual": residual})  # fmt: skip
     return rows
@@ -158,10 +158,8 @@ def heights(case: Case) -> dict:
     for name in BLOCKS:
         out[name] = {}
         for pads, compliant in (("rigid", False), ("compliant", True)):
-            found = [
-                by_formula(case, i, compliant).properties[name]["height"] for i in range(len(case.trials))
-            ]
-            residual = np.array([f.mean for f in found if f is not None]) - case.blocks[name]["height"][0]
+            found = [by_formula(case, i, compliant)[name]["height"] for i in range(len(case.trials))]
+            residual = np.array([f["mean"] for f in found if f is not None]) - case.blocks[name]["height"][0]
             out[name][pads] = {"mean": residual.mean(), "rms": np.sqrt(np.mean(residual**2)),
                                "each": residual}  # fmt: skip
     return out

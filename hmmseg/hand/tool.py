@@ -17,7 +17,7 @@ throughout.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -149,27 +149,32 @@ SAMPLES = 20  # numerics: of free motion, at least
 class Tool:
     """The tool as free motion shows it: `axes` Q (3, 3), `offset` and `drift` (3,) [N, N/s].
 
-    `mass` [kg] by weight (`weighed`: apart from the offset), `inertia` [kg] by acceleration, `drag`
-    [N s/m]; `jerked` [kg s]: of how the acceleration changes, which is by how much later than the wrench the
-    pose was taken, times the inertia; `noise` [N]: scale of one component of F in free motion about the
-    model; `since` [s]: when the drift has added nothing to the offset, `drift_sd` [N/s]: its standard error;
-    `against`: the reading goes against a stated sign; `centre_of_mass` (3,) [m] in the tool's axes, None
-    where no torques or turns determine it.
+    `shares` (4,): what goes with the acceleration (inertia) [kg], with the weight [kg] (0 unless `weighed`:
+    apart from the offset), with the velocity (drag) [N s/m] and with how the acceleration changes [kg s],
+    which is by how much later than the wrench the pose was taken, times the inertia; `noise` [N]: scale of
+    one component of F in free motion about the model; `since` [s]: when the drift has added nothing to the
+    offset, `drift_sd` [N/s]: its standard error; `against`: the reading goes against a stated sign.
     """
 
     axes: np.ndarray
-    mass: float
+    shares: np.ndarray
     weighed: bool
-    inertia: float
-    drag: float
-    jerked: float
     offset: np.ndarray
     drift: np.ndarray
     noise: float
     since: float
     drift_sd: float
     against: bool = False
-    centre_of_mass: np.ndarray | None = None
+
+    @property
+    def inertia(self) -> float:
+        """Its mass by acceleration [kg]."""
+        return float(self.shares[0])
+
+    @property
+    def mass(self) -> float:
+        """Its mass by weight [kg], or by acceleration where the weight goes into the offset."""
+        return float(self.shares[1] if self.weighed else self.shares[0])
 
 
 @dataclass(frozen=True)
@@ -184,6 +189,12 @@ class FreeMotion:
     force: np.ndarray
     terms: np.ndarray
     window: float
+
+    def followed_by(self, more: FreeMotion, most: int) -> FreeMotion:
+        """Both together, of which the last `most` samples are kept."""
+        t, force = np.concatenate([self.t, more.t]), np.concatenate([self.force, more.force])
+        terms = np.concatenate([self.terms, more.terms], axis=1)
+        return FreeMotion(t[-most:], force[-most:], terms[:, -most:], more.window)
 
 
 def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
@@ -216,13 +227,11 @@ def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMot
 
 def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
     """The tool from free motion, samples `free` (num_timesteps,); InputError where it is undetermined."""
-    motion = free_motion(trial, rig, pose, free)
-    tool = tool_of(trial.file, rig, motion, float(trial.t.mean()))
-    return replace(tool, centre_of_mass=_centre_of_mass(trial, rig.wrist, tool, free, motion.terms))
+    return tool_of(trial.file, rig, free_motion(trial, rig, pose, free), float(trial.t.mean()))
 
 
 def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool = True) -> Tool:
-    """The tool, its centre of mass left open; InputError where free motion says nothing, or another rig.
+    """The tool; InputError where free motion says nothing, or another rig.
 
     `between`: what is to be read lies between samples of free motion. Else the offset's drift is carried on
     only where it shows clearly.
@@ -232,76 +241,50 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     if motion.t.size < SAMPLES:
         raise InputError(where, "show no free motion to find the tool's own share from",
                          "samples before the first grip and after the last")  # fmt: skip
-    force, terms = motion.force, motion.terms
-    time = motion.t - since
-    turns = gripper.turns and gripper.frame != "world" and _spread(terms[1]) > TURNED * rig.gravity
     # Smoothed samples within one window go together.
     together = max(1.0, motion.window / float(np.median(np.diff(motion.t))))
-    axes, fitted, scale = _fit(rig, force, terms, time, turns)
-    error = scale * np.sqrt(together) * fitted.errors
-    if not between and np.all(np.abs(fitted.drift) < SURE * error[2:]):
-        axes, fitted, scale = _fit(rig, force, terms, 0 * time, turns)
+    time = motion.t - since
+    axes, found, unit, noise = _fit(rig, motion, time)
+    error = noise * np.sqrt(together) * unit
+    if not between and np.all(np.abs(found[7:]) < SURE * error[7:]):
+        axes, found, _, noise = _fit(rig, motion, 0 * time)
     left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
-    if (left_open or gripper.reaction is None) and abs(fitted.inertia) < SURE * float(error[0]):
+    if (left_open or gripper.reaction is None) and abs(found[0]) < SURE * error[0]:
         problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
         raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
                          "under [gripper], as they are mounted")  # fmt: skip
-    mass = fitted.mass if fitted.mass is not None else fitted.inertia
-    offset, drift = axes @ fitted.offset, axes @ fitted.drift
-    against = gripper.reaction is not None and fitted.inertia < -SURE * float(error[0])
     return Tool(
-        axes, mass, fitted.mass is not None, fitted.inertia, fitted.drag, fitted.jerked, offset, drift, scale,
-        since, float(error[2:].max()), against,
+        axes, found[:4], bool(found[1] != 0.0), axes @ found[4:7], axes @ found[7:], noise, since,
+        float(error[7:].max()), bool(gripper.reaction is not None and found[0] < -SURE * error[0]),
     )  # fmt: skip
 
 
-def _fit(rig: Rig, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns: bool
-         ) -> tuple[np.ndarray, _Fitted, float]:  # fmt: skip
-    """Axes, the regression along them and the scale of what it leaves, robustly, in turns."""
-    gripper = rig.wrist
-    weights = np.ones(len(force))
-    for _ in range(ROUNDS):
-        axes = _axes(gripper, weights, force, terms[0] + terms[1])
-        fitted = _regressed(weights, force @ axes, terms, time, turns, gripper.tool_mass)
-        scale = max(robust_sd(fitted.residual), 1e-6)
-        weights = (TAIL + 3) / (TAIL + ((fitted.residual / scale) ** 2).sum(axis=1))
-    return axes, fitted, scale
+def _fit(rig: Rig, motion: FreeMotion, time: np.ndarray
+         ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:  # fmt: skip
+    """Axes, what follows along them, its standard errors for unit noise, and the noise.
 
-
-@dataclass(frozen=True)
-class _Fitted:
-    """`mass` None where it goes into the offset; `errors` of inertia, drag and drift (3) for unit noise."""
-
-    inertia: float
-    mass: float | None
-    drag: float
-    jerked: float
-    offset: np.ndarray
-    drift: np.ndarray
-    residual: np.ndarray
-    errors: np.ndarray
-
-
-def _regressed(weights: np.ndarray, force: np.ndarray, terms: np.ndarray, time: np.ndarray, turns: bool,
-               given: float | None) -> _Fitted:  # fmt: skip
-    """Least squares of F in the tool's axes (n, 3) on the terms; what is not there is left out."""
-    n = len(force)
+    Robust least squares, in turns with the axes, of F in the tool's axes on the four terms (of a hand that
+    does not turn the weight is a part of the offset), the offset (3) and the drift (3).
+    """
+    gripper, terms, n = rig.wrist, motion.terms, motion.t.size
+    turns = gripper.turns and gripper.frame != "world" and _spread(terms[1]) > TURNED * rig.gravity
+    given = gripper.tool_mass
+    known = 0.0 if given is None else given * terms[1]
+    hung = terms[1] * (turns and given is None)
     constant = np.broadcast_to(np.eye(3), (n, 3, 3))  # row, axis, parameter
-    moved, hung, dragged, jerk = (term[:, :, None] for term in terms)
-    columns = [moved, dragged, jerk, constant, constant * time[:, None, None]]
-    left = force if given is None else force - given * terms[1]
-    if turns and given is None:
-        columns.insert(3, hung)
-    rows = np.concatenate(columns, axis=2)
-    root = np.sqrt(weights)[:, None]
-    flat = (rows * root[:, :, None]).reshape(3 * n, -1)
-    found, *_ = np.linalg.lstsq(flat, (left * root).ravel(), rcond=1e-9)
-    information = flat.T @ flat
-    errors = np.sqrt(np.diag(np.linalg.pinv(information, rcond=1e-9)))[[0, 1, -3, -2, -1]]
-    mass = given if given is not None else float(found[3]) if turns else None
-    residual = left - rows @ found
-    inertia, drag, jerked = (float(each) for each in found[:3])
-    return _Fitted(inertia, mass, drag, jerked, found[-6:-3], found[-3:], residual, errors)
+    moving = np.stack([terms[0], hung, terms[2], terms[3]], axis=2)
+    rows = np.concatenate([moving, constant, constant * time[:, None, None]], axis=2)
+    weights = np.ones(n)
+    for _ in range(ROUNDS):
+        axes = _axes(gripper, weights, motion.force, terms[0] + terms[1])
+        left, root = motion.force @ axes - known, np.sqrt(weights)[:, None]
+        flat = (rows * root[:, :, None]).reshape(3 * n, -1)
+        found, *_ = np.linalg.lstsq(flat, (left * root).ravel(), rcond=1e-9)
+        residual = left - rows @ found
+        noise = max(robust_sd(residual), 1e-6)
+        weights = (TAIL + 3) / (TAIL + ((residual / noise) ** 2).sum(axis=1))
+    found[1] = given or found[1] * turns
+    return axes, found, np.linalg.norm(np.linalg.pinv(flat, rcond=1e-9), axis=1), noise
 
 
 def _spread(vectors: np.ndarray) -> float:
@@ -329,36 +312,11 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
     return (left * flip) @ right
 
 
-def _centre_of_mass(trial: Trial, gripper: Gripper, tool: Tool, free: np.ndarray,
-                    terms: np.ndarray) -> np.ndarray | None:  # fmt: skip
-    """Where the tool's mass sits, from how torques go with its specific force as the hand turns."""
-    axes, felt = tool.axes, terms[0] + terms[1]
-    if gripper.centre_of_mass is not None:
-        return np.asarray(gripper.centre_of_mass)
-    if len(gripper.wrench) < 6 or gripper.frame == "world":
-        return None
-    if not gripper.turns or _spread(felt / np.linalg.norm(felt, axis=1, keepdims=True)) < TURNED:
-        return None
-    torque = np.stack([bridged(trial.channels[name], trial.t) for name in gripper.wrench[3:]], axis=1)
-    torque = smooth(trial.t, torque)[free] @ axes * np.linalg.det(axes)  # an axial vector in the tool's axes
-    arm = tool.mass * felt
-    # torque = c x arm + offset: linear in c
-    cross = np.zeros((len(arm), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = arm[:, 2], -arm[:, 1], arm[:, 0]
-    cross -= np.swapaxes(cross, 1, 2)
-    rows = (cross - cross.mean(axis=0)).reshape(-1, 3)
-    found, *_ = np.linalg.lstsq(rows, (torque - torque.mean(axis=0)).reshape(-1), rcond=1e-3)
-    return found
-
-
 def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
     """What the tool does to its environment (num_timesteps, 3), in the world's axes [N]."""
     gripper = rig.wrist
     reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - tool.since)[:, None]
-    moved, hung, dragged, jerk = _terms(pose, gripper, rig.gravity)
-    own = tool.inertia * moved + tool.drag * dragged + tool.jerked * jerk
-    if tool.weighed:
-        own = own + tool.mass * hung
+    own = np.tensordot(tool.shares, _terms(pose, gripper, rig.gravity), 1)
     force = reading @ tool.axes - own
     return force if gripper.frame == "world" else np.einsum("tij,tj->ti", pose.turned, force)
 

@@ -2,9 +2,8 @@
 
 The wrist feels the sum of what both fingers do; each finger's channels hold half of it. What
 they press against each other with does not reach the wrist. Where no grip force is recorded, the
-pads' own spring gives it: their squeeze is the opening at which they touched less the one they are
-held at. That says when something is held, and where the touch lies within what
-the slowing of the closing leaves open, but is no measured force: friction is not bounded by it.
+pads' own spring gives it: their squeeze is the opening at which they touched (`hmmseg.hand.grips`) less the
+one they are held at. That says when something is held, but is no measured force: it does not bound friction.
 
 A hand that is raised with what it holds bears it. Where no hold lifts anything, the columns are read the
 other ways that a rig may have it, and the way in which the hand lifts something every time is what to write.
@@ -14,176 +13,21 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hand.grips import Grip, closings, free_samples, grip_of
 from hmmseg.hand.plausibility import REACH, Finding, all_changed, changed, length_unit
 from hmmseg.hand.sensing import tool_warnings
-from hmmseg.hand.signals import grouped
 from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warnings, pose_of, smooth
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import MOVED, SURE
-from hmmseg.robust import bridged, robust_sd, runs, white_sd
-
-STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
-SLOWED = 0.9  # chosen: share of its speed that a closing keeps until the first touch
-ABRUPT = 0.5  # chosen: share of its speed that a closing loses from one step to the next at a hard touch
-SOFT = 0.1  # prior: of what gives in a grip: its touch is known no better, as pads are no ideal springs
-GIVE = (1e-3, 1.5e-3)  # prior: m, mean and sd: what pads and drive give in a grip, before anything is seen
-WRONG = 0.2  # prior: how often one of the estimates of the touch is of something else
-TAIL, NODES, GRID = (
-    4.0,
-    400,
-    1e-4,
-)  # numerics: degrees of freedom of the prior; its grid, and least extent [m]
-REST = 0.1  # chosen: share of an opening's way, or of its top speed, that is next to none: the gripper stands
-LEAST_CLOSING = 1e-3  # limit: m; a smaller swing of the opening is no grip
-
-
-@dataclass(frozen=True)
-class Grip:
-    """One closing on something: samples [start, stop) in which the pads touch it.
-
-    `held` [m]: the opening at which it stands; `width` [m] and `width_sd`: the opening at which both
-    pads just touch.
-    """
-
-    start: int
-    stop: int
-    held: float
-    width: float
-    width_sd: float
-
-
-def closings(opening: np.ndarray) -> list[tuple[int, int, int]]:
-    """Closings that end in a stand, as samples (begun, least, opened), by turning points.
-
-    A swing counts where it is a tenth of the whole way and beyond the noise.
-    """
-    noise = white_sd(opening)
-    swing = max(REST * float(np.ptp(opening)), 2 * SURE * noise, LEAST_CLOSING)
-    turning, last = [0], 0
-    rising: bool | None = None
-    for i, value in enumerate(opening):
-        if rising is None:
-            if abs(value - opening[0]) > swing:
-                rising, last = bool(value > opening[0]), i
-        elif (value > opening[last]) == rising:
-            last = i
-        elif abs(value - opening[last]) > swing:
-            turning.append(last)
-            rising, last = not rising, i
-    turning += [last] * (last != turning[-1])
-    turning += [len(opening) - 1] * (turning[-1] != len(opening) - 1)
-    found = []
-    for before, least, after in zip(turning, turning[1:], [*turning[2:], turning[-1]], strict=False):
-        if opening[before] - opening[least] > swing / 2:
-            found.append((before, least, after))
-    return found
-
-
-def grip_of(t: np.ndarray, opening: np.ndarray, active: np.ndarray, closing: tuple[int, int, int],
-            give: float | None) -> Grip | None:  # fmt: skip
-    """The grip that a closing ends in; None where the opening never stands.
-
-    `active` (num_timesteps,): where the wrist feels something; `give` [m]: what the pads give while
-    held, where it is known.
-    """
-    begun, least, opened = closing
-    floor = float(opening[least])
-    ceiling = min(float(opening[begun]), float(opening[opened])) if opened > least else float(opening[begun])
-    inside = np.arange(begun, opened + 1)
-    low = inside[opening[inside] <= floor + REST * (ceiling - floor)]
-    held, first, last = float(np.median(opening[low])), int(low[0]), int(low[-1])
-    if give is not None:
-        width, sd = held + give, 0.0
-    else:
-        released = _release(t, opening, active, last, opened, held)
-        width, sd = _together([_touch(t, opening, begun, first, held), *released], held, ceiling)
-    start = int(inside[np.argmax(opening[inside] <= width)])
-    after = np.flatnonzero(opening[last : opened + 1] > width)
-    stop = int(last + after[0]) if after.size else opened + 1
-    return Grip(start, stop, held, width, sd) if stop - start > 2 else None
-
-
-def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.ndarray:
-    """The opening [m] every STEP, means of what lies within, of samples [start, stop)."""
-    group = max(1, int(STEP / float(np.median(np.diff(t))) + 1e-6))
-    return grouped(opening[start:stop], group)[0]
-
-
-def _kink(way: np.ndarray, noise: float) -> tuple[float, float] | None:
-    """Where a way (n,) that leaves a stand takes off [m], and its sd; None where noise hides it."""
-    if way.size < 4:
-        return None
-    third = way[3:] - 3 * way[2:-1] + 3 * way[1:-2] - way[:-3]
-    at = int(np.argmax(third))
-    if third[at] < SURE * np.sqrt(20) * noise:
-        return None
-    return float(way[at + 2]), max(float(way[at + 3] - way[at + 1]) / 4, noise)
-
-
-def _noise(opening: np.ndarray) -> float:
-    """Noise sd [m] of one sample of the opening."""
-    return max(white_sd(opening), 1e-6)
-
-
-def _touch(t: np.ndarray, opening: np.ndarray, begun: int, first: int, held: float) -> tuple[float, float]:
-    """Touch while closing [m]: between where it begins to slow down and where it has most."""
-    way = _coarse(t, opening, begun, first + max(4, int(4 * STEP / np.median(np.diff(t)))))
-    speed = way[:-1] - way[1:]
-    fast = np.flatnonzero(speed >= SLOWED * speed.max()) if speed.size else np.zeros(0, int)
-    early = float(opening[begun])
-    if fast.size:
-        at = int(fast[-1])
-        stopped = at + 1 >= speed.size or speed[at + 1] < ABRUPT * speed[at]
-        early = float(way[at] if stopped else way[at + 1])  # a step that ends in a stop may end in the touch
-    kink = _kink(way[::-1], _noise(opening))
-    late = held if kink is None else kink[0]
-    early, late = max(early, late, held), max(min(early, late), held)
-    return (early + late) / 2, max((early - late) / np.sqrt(12), _noise(opening))
-
-
-def _release(t: np.ndarray, opening: np.ndarray, active: np.ndarray, last: int, opened: int, held: float
-             ) -> list[tuple[float, float]]:  # fmt: skip
-    """Openings [m] at which the fingers took off, and at which what the wrist felt ended, with sds."""
-    found = []
-    lead = max(3, int(3 * STEP / np.median(np.diff(t))))
-    way = _coarse(t, opening, max(last - lead, 0), opened + 1)
-    top = float(opening[opened]) if opened > last else held
-    wide = np.flatnonzero(way > (held + top) / 2)
-    kink = _kink(way[: wide[0] + 2] if wide.size else way, _noise(opening))
-    if kink is not None and kink[0] > held:
-        found.append(kink)
-    felt = np.flatnonzero(active[last : opened + 1])
-    if felt.size and last + felt[-1] < opened and active[last : last + felt[-1] + 1].all():
-        i = int(last + felt[-1])
-        before, after = float(opening[i]), float(opening[i + 1])
-        if before > held:
-            found.append(((before + after) / 2, abs(after - before) / np.sqrt(12)))
-    return found
-
-
-def _together(estimates: list[tuple[float, float]], held: float, top: float) -> tuple[float, float]:
-    """Mean and sd [m] of the opening at the touch, between the one held and the widest, `top`.
-
-    What pads and drive give is the prior (Student-t); each estimate is right within its sd, or is of
-    something else (a finger that drags the block on, an opening in two steps) and shows nothing.
-    """
-    width = np.linspace(held, max(top, held + GRID), NODES)
-    log_density = -(TAIL + 1) / 2 * np.log1p(((width - held - GIVE[0]) / GIVE[1]) ** 2 / TAIL)
-    for value, sd in estimates:
-        sd = max(sd, float(width[1] - width[0]))
-        right = np.exp(-0.5 * ((width - value) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
-        log_density += np.log((1 - WRONG) * right + WRONG / float(width[-1] - width[0]))
-    density = np.exp(log_density - log_density.max())
-    density /= density.sum()
-    mean = float(density @ width)
-    return mean, max(float(np.sqrt(density @ (width - mean) ** 2)), SOFT * (mean - held))
-
+from hmmseg.robust import bridged, robust_sd, runs
 
 WIDEST = 1.0  # limit: m; no parallel gripper opens further
 NARROW = 2e-4  # limit: m
@@ -302,8 +146,8 @@ def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
     return InputError(where, problem, f"position = {{{text}}} under [gripper]")
 
 
-TOGETHER = 5  # chosen: samples within one smoothing window
 LEAST = 3  # numerics: samples; of fewer there is no scatter
+WENT = 4  # numerics: smoothing windows of a hand that goes somewhere before what it bears is judged
 
 
 @dataclass(frozen=True)
@@ -324,15 +168,12 @@ class Held:
 def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None
             ) -> Held:  # fmt: skip
     """What closings of the opening (num_timesteps,) [m] hold; `pressing` as `grip_force_of` has it."""
-    held, free = closings(opening), np.ones(opening.size, bool)
-    for begun, least, opened in held:  # surely free is what is more open than halfway back
-        top = min(opening[begun], opening[opened]) if opened > least else opening[begun]
-        inside = slice(begun, opened + 1)
-        free[inside] &= ~(opening[inside] < opening[least] + 0.5 * (top - opening[least]))
+    held = closings(opening)
+    free = free_samples(opening, held)
     tool = free_tool(trial, rig, pose, free)
     force = applied_force(trial, rig, pose, tool)
-    active = np.linalg.norm(np.nan_to_num(force), axis=1) > SURE * tool.noise
-    each = [grip_of(trial.t, opening, active, c, give_of(rig, pressing, opening, c)) for c in held]
+    stiffness = rig.fingertip.normal_stiffness
+    each = [grip_of(trial.t, opening, closing, pressing, stiffness) for closing in held]
     grips = [grip for grip in each if grip is not None]
     loads = [_load(grip, pose, force, tool) for grip in grips]
     lifts = [load for grip, load in zip(grips, loads, strict=True) if load and _raised(grip, pose).any()]
@@ -366,30 +207,15 @@ def _lifts_all(loads: list[float | None]) -> bool:
     return bool(there) and min(there) > 0
 
 
-def grip_force_of(trial: Trial, gripper: Gripper) -> np.ndarray | float | None:
+def grip_force_of(channels: Mapping[str, Any], gripper: Gripper) -> np.ndarray | float | None:
     """What each pad presses with [N]: samples, or a number while it grips; None where it is unknown."""
     if isinstance(gripper.grip_force, str):
-        return np.abs(trial.channels[gripper.grip_force])
+        return np.abs(channels[gripper.grip_force])
     if gripper.grip_force is not None:
         return float(gripper.grip_force)
     if gripper.motor_current is not None and gripper.force_per_ampere is not None:
-        return np.abs(trial.channels[gripper.motor_current]) * gripper.force_per_ampere
+        return np.abs(channels[gripper.motor_current]) * gripper.force_per_ampere
     return None
-
-
-def give_of(rig: Rig, pressing: np.ndarray | float | None, opening: np.ndarray, closing: tuple[int, int, int]
-            ) -> float | None:  # fmt: skip
-    """What both pads give while held [m]; None where the force is not known."""
-    if pressing is None:
-        return None
-    if not isinstance(pressing, np.ndarray):
-        force = pressing
-    else:
-        begun, least, opened = closing
-        inside = slice(begun, opened + 1)
-        low = opening[inside] <= opening[least] + REST * (opening[begun] - opening[least])
-        force = float(np.nanmedian(pressing[inside][low]))
-    return 2 * force / rig.fingertip.normal_stiffness if np.isfinite(force) else None
 
 
 def _raised(grip: Grip, pose: Pose) -> np.ndarray:
@@ -407,20 +233,41 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
 
     None where it never goes anywhere, which leaves nothing to judge by.
     """
-    inside = slice(grip.start, grip.stop)
-    moved = _raised(grip, pose)
-    lifted = bool(moved.any())
-    if not lifted:
-        moved = np.linalg.norm(pose.position[inside] - pose.position[grip.start], axis=1) > MOVED
-    load = force[inside][moved] @ (pose.up if lifted else pose.across)
+    raised, gone = _raised(grip, pose), went(grip.start, grip.stop, pose)
+    lifted, inside = bool(raised.any()), slice(grip.start, grip.stop)
+    moved, way = (raised, pose.up) if lifted else (gone, pose.across)
+    load = borne(force[inside][moved] @ way, pose, tool)
+    return load if lifted or load is None else abs(load)
+
+
+def went(start: int, stop: int, pose: Pose) -> np.ndarray:
+    """Which samples from `start` to `stop` the hand has gone away from where it is at first."""
+    return np.linalg.norm(pose.position[start:stop] - pose.position[start], axis=1) > MOVED
+
+
+def borne(load: np.ndarray, pose: Pose, tool: Tool) -> float | None:
+    """What samples of a load (num_samples,) [N] agree on, 0 where it is within its noise; None of too few.
+
+    Samples within one smoothing window go together.
+    """
     load = load[np.isfinite(load)]
     if load.size <= LEAST:
         return None
-    scatter = max(robust_sd(load - np.median(load)), tool.noise)
     found = float(np.median(load))
-    if abs(found) <= SURE * scatter / np.sqrt(load.size / TOGETHER):
-        return 0.0
-    return found if lifted else abs(found)
+    independent = load.size / max(1.0, pose.window / float(np.median(np.diff(pose.t))))
+    scatter = max(robust_sd(load - found), tool.noise) / np.sqrt(independent)
+    return found if abs(found) > SURE * scatter else 0.0
+
+
+def bears(start: int, stop: int, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
+    """As a grip's load [N] where it lasts still; None until the hand has gone somewhere for long enough."""
+    gone, height = went(start, stop, pose), pose.position[start:stop] @ pose.up
+    gone &= np.isfinite(force[start:stop]).all(axis=1)
+    if gone.sum() * float(np.median(np.diff(pose.t))) < WENT * pose.window:
+        return None
+    raised = height[gone] - height[0] > MOVED
+    up, aside = (borne(force[start:stop][gone] @ way, pose, tool) or 0.0 for way in (pose.up, pose.across))
+    return up if raised.mean() > 0.5 else max(abs(up), abs(aside))
 
 
 # prior: s; sd by which pads touch and let go off the opening's width by this: they are no ideal springs
@@ -469,7 +316,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     gripper = rig.wrist
     pose = pose_of(trial, gripper)
     opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
-    pressing = grip_force_of(trial, gripper)
+    pressing = grip_force_of(trial.channels, gripper)
     held = held_by(trial, rig, pose, opening, pressing)
     signs: tuple[str, ...] = ()
     if held.lifts and max(held.lifts) < 0:

@@ -52,8 +52,8 @@ class Gripper(StrictTable):
     the `sensor`, the `tool` or the `world` (`frame`). `sensor_axes`: along which axes of the tool the
     sensor's x, y, z point. `reaction`: the wrench is what the environment does to the tool, not what
     the tool does. What is not said of the two is found from how the tool's mass moves and hangs.
-    `tool_mass` [kg] and `centre_of_mass` [m] (tool's axes, from the sensor) are found from free motion
-    where they are not given, an offset of the sensor always.
+    `tool_mass` [kg] is found from free motion where it is not given, an offset of the sensor always.
+    `centre_of_mass` [m] (tool's axes, from the sensor) may be stated; forces do not depend on it.
 
     `closing`: the tool's axis along which the pads close. `fingertip`: where the pads' middle lies [m]
     (tool's axes, from the tool's position). `grip_force`: what each pad presses with, a column or a

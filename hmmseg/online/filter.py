@@ -53,8 +53,8 @@ from hmmseg.online.hypothesis import (
     read,
     widen,
 )
-from hmmseg.segmentation.boundaries import combine
-from hmmseg.segmentation.changes import Disagreement, Prior, moment
+from hmmseg.segmentation.boundaries import evenly
+from hmmseg.segmentation.changes import Prior, moment
 from hmmseg.segmentation.emissions import (
     MAX_RATE,
     WINDOW,
@@ -303,7 +303,7 @@ class Filter:
         near = (t[n + 1], t[n + 1] + DRIFTS) if touch else (t[n] - DRIFTS, t[n])
         contact = contacts(signals, sense([], [], (), parameters, self.rig), parameters)
         change = contact.change(*steps, Prior(t, probability, (float(t[0]), float(t[-1]))), near)
-        out = combine(t, probability, {}) if change is None else moment(change, Disagreement())
+        out = evenly(t, probability) if change is None else moment(change)
         if wrist and FREE in (before.state, after.state):
             out = nearest_touch(tuple(self.touches), out)
         median = out.quantile(0.5)

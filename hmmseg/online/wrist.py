@@ -3,11 +3,8 @@
 As `hmmseg.hand.wrist`, from the rows so far. What the tool itself puts on the sensor is found from
 the free motion before the first grip, so nothing can be said before that (all of it is the task's first
 subtask anyhow), and anew at every further one. Motion is smoothed over a window, so rows come out a window
-late; while the gripper closes or lets go, until it is known when it touched.
-
-Off line a closing is read from both of its ends (`hmmseg.hand.wrist`). While it happens, a touch shows only
-once the gripper stands, some tens of milliseconds after it; until then nobody knows whether samples since
-it slowed down were of a grip. Those are held back.
+late; while the gripper closes or lets go, until it is known when it touched: a touch shows only once the
+gripper stands.
 """
 
 from __future__ import annotations
@@ -15,30 +12,17 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hand.grips import LEAST_CLOSING, REST, Closings, Grip, grip_of, least_swing
 from hmmseg.hand.tool import WINDOW, FreeMotion, Pose, Tool, applied_force, free_motion, pose_of, tool_of
-from hmmseg.hand.wrist import (
-    LEAST_CLOSING,
-    REST,
-    SLOWED,
-    STEP,
-    TOGETHER,
-    Grip,
-    as_fingers,
-    give_of,
-    grip_force_of,
-    grip_of,
-    other_sign,
-)
+from hmmseg.hand.wrist import as_fingers, bears, grip_force_of, other_sign
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
-from hmmseg.levels import MOVED, SURE
-from hmmseg.robust import bridged, robust_sd, white_sd
+from hmmseg.robust import bridged, white_sd
 
 WHERE = "stream"
 BATCH = 0.02  # numerics: s that are turned into fingers together
@@ -62,18 +46,16 @@ class Wrist:
         self.rig, self.gripper, self.names = rig, rig.wrist, rig.wrist.channels
         self._rows: list[tuple[float, tuple[float, ...]]] = []  # in order of time, a window's context
         self._out = -math.inf  # up to where rows have come out
-        self._opening = Closings(self._gives)
-        self._last_opening = [math.nan] * len(self.gripper.opening)
+        self._opening = Opening(rig.fingertip.normal_stiffness)
+        self._newest = dict.fromkeys(self.names, math.nan)  # of each channel
         self._window: float | None = None
-        self._free: deque[FreeMotion] = deque()
-        self._num_free, self._free_until = 0, -math.inf
+        self._free: FreeMotion | None = None
+        self._free_until = -math.inf
         self._fitted = 0  # grips before which the tool was found
         self.tool: Tool | None = None
         self.touches: list[tuple[float, float]] = []
         self.mark: float | None = None  # start of a new grip, which has not come out yet [s]
         self.back = False  # the last grip was none: what has come out since it began comes again
-        self._went = Went()
-
         self.force_sd = 0.0  # by how much a drift that free motion did not show may be wrong in a grip [N]
 
     @property
@@ -103,30 +85,36 @@ class Wrist:
             insort(self._rows, (t, tuple(row)), key=lambda each: each[0])
             return "late"
         self._rows.append((t, tuple(row)))
-        where = [self.names.index(name) for name in self.gripper.opening]
-        for i, at in enumerate(where):
-            if math.isfinite(row[at]):
-                self._last_opening[i] = row[at]
-        opening = sum(self._last_opening)
+        self._newest |= {name: v for name, v in zip(self.names, row.tolist(), strict=True) if v == v}
+        opening = sum(self._newest[name] for name in self.gripper.opening)
         if math.isfinite(opening):
-            self._opening.take(t, opening)
+            pressing = grip_force_of(self._newest, self.gripper)
+            self._opening.follow(t, opening, math.nan if pressing is None else float(pressing))
         return None
 
     def ready(self, final: bool = False) -> list[tuple[float, np.ndarray]]:
         """Rows that are ready now, each once; with `final` all that are left."""
         if not self._rows:
             return []
-        newest = self.newest
-        if self.tool is None and not (self._opening.number or final):
+        newest, opening = self.newest, self._opening
+        if self.tool is None and not (opening.number or final):
             if self._rows[0][0] < newest - BACKLOG:  # older free motion is kept as what it says of the tool
-                self._gather(newest - BACKLOG / 2)
+                trial = self._trial()
+                if _has_values(trial):
+                    self._gather(trial, self._posed(trial), newest - BACKLOG / 2)
                 self._rows = [each for each in self._rows if each[0] >= newest - BACKLOG / 2]
             return []
-        until = newest if final else min(newest - (self._window or 0.0), self._opening.known)
-        if not final and until < self._out + BATCH and self._fitted == self._opening.number:
+        until = newest if final else min(newest - (self._window or 0.0), opening.known)
+        if not final and until < self._out + BATCH and self._fitted == opening.number:
             return []
         self._return()
-        return self._turned(until)
+        out = self._turned(until)
+        self._out = max(self._out, until)
+        keep, held = self._out, opening.held or opening.refused
+        if held is not None and held.start > self._out - KEPT:
+            keep = min(keep, held.start)
+        self._rows = [each for each in self._rows if each[0] > keep - AROUND * (self._window or 0.0)]
+        return out
 
     def _return(self) -> None:
         """Go back to where a grip began that was none."""
@@ -138,78 +126,49 @@ class Wrist:
             self._out = max(t for t, _ in self._rows if t < refused.start)
             self.touches = [touch for touch in self.touches if touch[0] <= self._out]
         self._free_until = min(self._free_until, self._out)
-        self._went = Went()
 
-    def _trial(self, rows: list[tuple[float, tuple[float, ...]]]) -> Trial:
-        values = np.array([row for _, row in rows])
-        return Trial(WHERE, np.array([t for t, _ in rows]),
+    def _trial(self) -> Trial:
+        values = np.array([row for _, row in self._rows])
+        return Trial(WHERE, np.array([t for t, _ in self._rows]),
                      {name: values[:, i] for i, name in enumerate(self.names)})  # fmt: skip
 
-    def _there(self, trial: Trial) -> bool:
-        """Whether every channel has a value to smooth."""
-        return trial.t.size > 3 and all(np.isfinite(c).any() for c in trial.channels.values())
+    def _posed(self, trial: Trial) -> Pose:
+        pose = pose_of(trial, self.gripper, self._window)
+        self._window = pose.window
+        return pose
 
     def _opened(self, trial: Trial) -> np.ndarray:
         """Opening (num_timesteps,) [m], gaps bridged."""
         return np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
 
-    def _gather(self, until: float) -> None:
+    def _gather(self, trial: Trial, pose: Pose, until: float) -> None:
         """Add free motion up to `until` to what the tool is found from."""
-        trial = self._trial(self._rows)
-        if not self._there(trial):
-            return
-        pose = pose_of(trial, self.gripper, self._window)
-        self._window = pose.window
-        opening = self._opened(trial)
-        free = self._opening.free(trial.t, opening) & (trial.t > self._free_until) & (trial.t <= until)
-        step = max(1, round(self._window / APART / float(np.median(np.diff(trial.t)))))
-        picked = np.flatnonzero(free)[::step]
+        free = self._opening.free(trial.t, self._opened(trial)) & (trial.t > self._free_until)
+        step = max(1, round(pose.window / APART / float(np.median(np.diff(trial.t)))))
+        picked = np.flatnonzero(free & (trial.t <= until))[::step]
         self._free_until = max(self._free_until, min(until, float(trial.t[-1])))
-        if picked.size == 0:
-            return
-        mask = np.zeros(trial.t.size, bool)
-        mask[picked] = True
-        found = free_motion(trial, self.rig, pose, mask)
-        self._free.append(found)
-        self._num_free += found.t.size
-        while self._num_free - self._free[0].t.size > FREE:
-            self._num_free -= self._free.popleft().t.size
-
-    def _find_tool(self) -> None:
-        self._fitted = self._opening.number
-        parts = [FreeMotion(np.zeros(0), np.zeros((0, 3)), np.zeros((4, 0, 3)), 0.0), *self._free]
-        motion = FreeMotion(
-            np.concatenate([p.t for p in parts]), np.concatenate([p.force for p in parts]),
-            np.concatenate([p.terms for p in parts], axis=1), self._window or 0.0,
-        )  # fmt: skip
-        if self.tool is not None and motion.t.size < 1:
-            return
-        since = float(motion.t.mean()) if motion.t.size else 0.0
-        self.tool = tool_of(WHERE, self.rig, motion, since, between=self._fitted > 1)
+        if picked.size:
+            found = free_motion(trial, self.rig, pose, np.isin(np.arange(trial.t.size), picked))
+            self._free = found if self._free is None else self._free.followed_by(found, FREE)
 
     def _turned(self, until: float) -> list[tuple[float, np.ndarray]]:
-        first = self.tool is None
-        self._gather(until)
-        if first or self._fitted != self._opening.number:
-            self._find_tool()
-            held = self._opening.held
-            self.mark = None if held is None else held.start
-        tool, window = self.tool, self._window
-        assert tool is not None and window is not None
-        trial = self._trial(self._rows)
-        out = [] if not self._there(trial) else self._as_rows(trial, tool, until)
-        if not out:
-            out = [(t, np.full(16, np.nan)) for t, _ in self._rows if self._out < t <= until]
-        self._out = max(self._out, until)
-        keep, held = self._out, self._opening.held or self._opening.refused
-        if held is not None and held.start > self._out - KEPT:
-            keep = min(keep, held.start)
-        keep -= AROUND * window
-        self._rows = [each for each in self._rows if each[0] > keep]
-        return out
+        """Rows up to `until` as those of two fingers."""
+        trial, opening = self._trial(), self._opening
+        if not _has_values(trial):
+            return [(t, np.full(16, np.nan)) for t, _ in self._rows if self._out < t <= until]
+        pose, first = self._posed(trial), self.tool is None
+        self._gather(trial, pose, until)
+        if first or self._fitted != opening.number:
+            self._fitted = opening.number
+            self.mark = None if opening.held is None else opening.held.start
+            motion = self._free or free_motion(trial, self.rig, pose, np.zeros(trial.t.size, bool))
+            if first or motion.t.size:
+                since = float(motion.t.mean()) if motion.t.size else 0.0
+                self.tool = tool_of(WHERE, self.rig, motion, since, between=self._fitted > 1)
+        assert self.tool is not None
+        return self._as_rows(trial, pose, self.tool, until)
 
-    def _as_rows(self, trial: Trial, tool: Tool, until: float) -> list[tuple[float, np.ndarray]]:
-        pose = pose_of(trial, self.gripper, self._window)
+    def _as_rows(self, trial: Trial, pose: Pose, tool: Tool, until: float) -> list[tuple[float, np.ndarray]]:
         force, near, grips = applied_force(trial, self.rig, pose, tool), np.zeros(trial.t.size), []
         for held in self._opening.grips:
             start, stop = np.searchsorted(trial.t, [held.start, held.stop]).tolist()
@@ -218,9 +177,17 @@ class Wrist:
                 near[max(start - 1, 0) : stop + 1] = 1.0
         for each in grips:
             near[each.start + 1 : each.stop - 1] = 2.0
-        found = as_fingers(trial, self.rig, pose, tool, self._opened(trial), force, grips,
-                           grip_force_of(trial, self.gripper))  # fmt: skip
-        self._decide(trial, pose, force, tool, until)
+        found = as_fingers(trial, self.rig, pose, tool, self._opened(trial), force.copy(), grips,
+                           grip_force_of(trial.channels, self.gripper))  # fmt: skip
+        held = self._opening.held
+        if held is not None and held.start <= until and not held.judged:
+            start, stop = np.searchsorted(trial.t, [held.start, until]).tolist()
+            load = bears(start, stop, pose, force, tool)
+            held.judged = load is not None
+            if load is not None and load < 0:
+                raise other_sign(trial, self.rig, load)
+            if load == 0.0:
+                self._opening.refuse()
         if self._opening.held is not None:
             self.force_sd = max(self.force_sd, tool.drift_sd * abs(until - tool.since))
         self.touches += [touch for touch in found.touches if self._out < touch[0] <= until]
@@ -234,33 +201,10 @@ class Wrist:
         chosen = np.flatnonzero((trial.t > self._out) & (trial.t <= until))
         return [(float(trial.t[i]), table[i]) for i in chosen]
 
-    def _decide(self, trial: Trial, pose: Pose, force: np.ndarray, tool: Tool, until: float) -> None:
-        """Whether the hand bears anything once it goes somewhere; InputError where that pulls up."""
-        held = self._opening.held
-        if held is None or held.start > until:
-            self._went = Went()
-            return
-        new = np.flatnonzero((trial.t > max(self._out, held.start)) & (trial.t <= until))
-        height, up, across = pose.position @ pose.up, force @ pose.up, force @ pose.across
-        for i in new[np.isfinite(force[new]).all(axis=1)]:
-            self._went.take(float(trial.t[i]), float(height[i]), pose.position[i], float(up[i]),
-                            float(across[i]), pose.window / TOGETHER)  # fmt: skip
-        load = self._went.load(tool.noise)
-        if load is None:
-            return
-        if load < 0:
-            raise other_sign(trial, self.rig, load)
-        if load == 0.0:
-            self._opening.refuse()
 
-    def _gives(self, t: np.ndarray, opening: np.ndarray) -> float | None:
-        """What the pads give in a closing that ends now [m]."""
-        rows = [each for each in self._rows if each[0] >= t[0]]
-        if not rows:
-            return None
-        trial, last = self._trial(rows), len(rows) - 1
-        way = np.interp(trial.t, t, opening)
-        return give_of(self.rig, grip_force_of(trial, self.gripper), way, (0, last, last))
+def _has_values(trial: Trial) -> bool:
+    """Whether every channel has a value to smooth."""
+    return trial.t.size > 3 and all(np.isfinite(c).any() for c in trial.channels.values())
 
 
 def checked(rig: Rig, t: float, row: np.ndarray) -> None:
@@ -276,7 +220,6 @@ def checked(rig: Rig, t: float, row: np.ndarray) -> None:
 
 
 STAND = 0.1  # chosen: s of next to no motion: the gripper stands
-SAMPLES = 4  # numerics: of a stand at least, and steps: what the touch is read from
 PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as a boundary is waited for
 NOISE = 200  # numerics: samples that determine the opening's noise
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
@@ -284,41 +227,38 @@ REMEMBERED = 10.0  # numerics: s of a closing that are kept
 
 @dataclass
 class Held:
-    """One grip: from `start` to `stop` [s], inf while it lasts; `grip` as off line."""
+    """One grip: from `start` to `stop` [s], inf while it lasts; `grip` as off line.
+
+    `judged`: whether it is known that the hand bears something.
+    """
 
     start: float
     grip: Grip
     stop: float = math.inf
+    judged: bool = False
 
 
-class Closings:
-    """Follows an opening, sample by sample.
+class Opening(Closings):
+    """Follows an opening, sample by sample, between pads of a stiffness [N/m].
 
-    `grips`: the last two. `known` [s]: up to when it is known what is held. `give` says of a closing's
-    times what the pads give in it [m], None where nothing tells.
+    `grips`: the last two. `known` [s]: up to when it is known what is held. `number`: grips so far.
+    `refused`: the last one, where it was none.
     """
 
-    def __init__(self, give: Callable[[np.ndarray, np.ndarray], float | None]) -> None:
-        self._give = give
+    def __init__(self, stiffness: float) -> None:
+        super().__init__(LEAST_CLOSING)
+        self.stiffness, self.number, self.known = stiffness, 0, -math.inf
         self.grips: deque[Held] = deque(maxlen=2)
-        self.known = -math.inf
-        self.closing, self.number = False, 0  # whether it closes now, and how many grips there were
-        self.refused: Held | None = None  # the last one, where it was no grip
-        self._kept: deque[tuple[float, float]] = deque()  # since the widest opening before
+        self.refused: Held | None = None
+        self._way: deque[tuple[float, float, float]] = deque()  # since it was widest
         self._low, self._high = math.inf, -math.inf
-        self._noise, self._seen = 0.0, 0
-        self._recent: deque[float] = deque(maxlen=NOISE // 10)
-        self._fastest, self._slowed, self._floor, self._wide = 0.0, -math.inf, math.inf, math.nan
+        self._noise, self._recent = 0.0, []
+        self._fastest, self._wide = 0.0, math.nan
 
     @property
     def held(self) -> Held | None:
         """The grip that lasts."""
         return self.grips[-1] if self.grips and self.grips[-1].stop == math.inf else None
-
-    @property
-    def swing(self) -> float:
-        """Least motion of the opening that counts [m]."""
-        return max(REST * (self._high - self._low), 2 * SURE * self._noise, LEAST_CLOSING)
 
     def free(self, t: np.ndarray, opening: np.ndarray) -> np.ndarray:
         """Which samples are surely of free motion: outside of every grip, more open than halfway."""
@@ -327,128 +267,64 @@ class Closings:
             free &= (t < held.start) | ((t >= held.stop) & (opening >= (held.grip.held + self._high) / 2))
         return free
 
-    def take(self, t: float, opening: float) -> None:
-        """The next sample."""
-        self._recent.append(opening)
-        if self._seen < NOISE and len(self._recent) == NOISE // 10:
-            self._seen += NOISE // 10
-            self._noise = max(self._noise, white_sd(np.array(self._recent)))
-            self._recent.clear()
+    def follow(self, t: float, opening: float, pressing: float = math.nan) -> None:
+        """The next sample; `pressing` [N]: what each pad presses with, where it is known."""
+        if len(self._recent) < NOISE:
+            self._recent.append(opening)
+            if len(self._recent) % (NOISE // 10) == 0:
+                self._noise = max(self._noise, white_sd(np.array(self._recent[-NOISE // 10 :])))
         self._low, self._high = min(self._low, opening), max(self._high, opening)
-        if not (self.held or self.closing or (self._kept and opening < self._kept[0][1])):
-            self._kept.clear()
-        self._kept.append((t, opening))
-        while t - self._kept[0][0] > REMEMBERED:
-            self._kept.popleft()
+        self.swing = least_swing(self._high - self._low, self._noise)
+        turned = self.take(t, opening)
+        if not self.closing and self.extreme[0] == t:
+            self._way.clear()
+        self._way.append((t, opening, pressing))
+        while t - self._way[0][0] > REMEMBERED:
+            self._way.popleft()
         if self.held is not None:
-            self._hold(t, opening)
+            self._hold(self.held, t, opening)
         elif self.closing:
+            self._fastest *= not turned
             self._close(t, opening)
         else:
             self.known = t
-            if opening < self._kept[0][1] - self.swing:
-                self.closing, self._fastest, self._slowed, self._floor = True, 0.0, t, opening
-
-    def _speed(self, over: float) -> float:
-        """Closing speed over the last `over` s [m/s]."""
-        t, opening = self._kept[-1]
-        for then, before in reversed(self._kept):
-            if t - then >= over - 1e-9:
-                return (before - opening) / (t - then)
-        return math.nan
 
     def _close(self, t: float, opening: float) -> None:
-        self._floor = min(self._floor, opening)
-        if opening > self._floor + self.swing:  # it opens again and has gripped nothing
-            self._open(t, opening)
+        """Samples wait until it stands."""
+        self.known = max(self.known, t - PATIENCE)
+        then = next((each for each in reversed(self._way) if t - each[0] >= STAND - 1e-9), None)
+        if then is None:
             return
-        fast = self._speed(STEP)
-        if fast >= SLOWED * self._fastest:
-            self._slowed = t
-        self._fastest = max(self._fastest, fast)
-        self.known = max(self._slowed, t - PATIENCE)
-        if t - self._slowed < STAND or not self._speed(STAND) < REST * self._fastest:
+        speed = (then[1] - opening) / (t - then[0])
+        self._fastest = max(self._fastest, speed)
+        if speed >= REST * self._fastest:
             return
-        times, way = np.array(self._kept).T
-        end = times.size - 1
-        stands = end - int(np.argmax(way <= way[end] + REST * (way[0] - way[end])))
-        if stands < max(SAMPLES, int(SAMPLES * STEP / float(np.median(np.diff(times))))):
-            return
-        grip = grip_of(times, way, np.zeros(times.size, bool), (0, end, end), self._give(times, way))
+        times, way, pressing = np.array(self._way).T
+        grip = grip_of(times, way, (0, int(way.argmin()), None), pressing, self.stiffness)
         if grip is None:
-            self._open(t, opening)
+            self._restart(t, opening)
             return
         self.grips.append(Held(max(float(times[grip.start]), self.known), grip))
-        self.refused = None
-        self.closing, self.known, self._wide = False, t, math.nan
+        self.refused, self.known, self._wide = None, t, math.nan
         self.number += 1
 
-    def _hold(self, t: float, opening: float) -> None:
-        held = self.grips[-1]
-        self._floor = min(self._floor, opening)
+    def _hold(self, held: Held, t: float, opening: float) -> None:
+        """Samples wait while it may be letting go."""
         if opening < held.grip.held - self.swing:  # it had only paused
-            self.refused = self.grips.pop()
-            self.closing, self._slowed, self.known = True, t, held.start
-            return
-        if opening <= held.grip.width:
+            self.refused, self.known = self.grips.pop(), held.start
+        elif self.closing and opening <= held.grip.width:
             self._wide, self.known = math.nan, t
-            return
-        if math.isnan(self._wide):
-            self._wide = t
-        self.known = max(self.known, t - PATIENCE)
-        if opening > max(held.grip.width, self._floor + REST * (self._high - self._floor)):
-            held.stop = self._wide
-            self._open(t, opening)
+        else:
+            self._wide = t if math.isnan(self._wide) else self._wide
+            self.known = max(self.known, t - PATIENCE)
+            if not self.closing:
+                held.stop, self.known = self._wide, t
 
     def refuse(self) -> None:
         """The grip that lasts turns out to hold nothing."""
         self.refused = self.grips.pop()
-        self._open(*self._kept[-1])
+        t, opening, _ = self._way[-1]
+        self._restart(t, opening)
 
-    def _open(self, t: float, opening: float) -> None:
-        self.closing, self.known = False, t
-        self._floor = math.inf
-        self._kept.clear()
-        self._kept.append((t, opening))
-
-
-WENT = 20  # numerics: samples of a hand that goes somewhere before what it bears is judged
-
-
-class Went:
-    """What a hand that holds on to something bears once it has gone somewhere."""
-
-    def __init__(self) -> None:
-        self._start: tuple[float, np.ndarray] | None = None
-        self._last, self._decided = -math.inf, False
-        self._up: list[float] = []
-        self._across: list[float] = []
-        self._raised = 0
-
-    def take(self, t: float, height: float, position: np.ndarray, up: float, across: float, apart: float
-             ) -> None:  # fmt: skip
-        """One sample: where it is and what it does to the world; nearer than `apart` [s] they count once."""
-        if self._start is None:
-            self._start = height, position
-        if self._decided or t < self._last + apart:
-            return
-        raised = height > self._start[0] + MOVED
-        if raised or np.linalg.norm(position - self._start[1]) > MOVED:
-            self._last = t
-            self._up.append(up)
-            self._across.append(across)
-            self._raised += raised
-
-    def load(self, noise: float) -> float | None:
-        """The load [N], 0 for nothing, below 0 for one that pulls up; None before or after it is judged."""
-        n = len(self._up)
-        if self._decided or n < WENT:
-            return None
-        self._decided = True
-        limit = SURE / math.sqrt(n / TOGETHER)
-        up, across = np.array(self._up), np.array(self._across)
-        found, aside = float(np.median(up)), float(np.median(across))
-        scatter = [max(robust_sd(v - np.median(v)), noise) for v in (up, across)]
-        if 2 * self._raised > n and abs(found) > limit * scatter[0]:
-            return found
-        return 1.0 if abs(aside) > limit * scatter[1] or abs(found) > limit * scatter[0] else 0.0
+    def _restart(self, t: float, opening: float) -> None:
+        self.closing, self.extreme, self.known = False, (t, opening), t

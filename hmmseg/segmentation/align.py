@@ -20,7 +20,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind
-from hmmseg.segmentation.changes import Change, Disagreement, disagreements
+from hmmseg.segmentation.changes import Change, discrepancies
 from hmmseg.segmentation.conformity import (
     MAX_RATE,
     Conformity,
@@ -35,12 +35,12 @@ from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import Sensing, read_again, sense
 from hmmseg.segmentation.posteriors import boundary_posteriors, contact_changes, to_spans
 from hmmseg.segmentation.rounds import (
-    InMemory,
     OnDisk,
     Recorded,
     cut,
     merge_point,
     one_round,
+    part,
     round_tasks,
     slices,
 )
@@ -68,7 +68,7 @@ class Reading:
 class Pool:
     """All recordings as they were read last, the fit of those that fit, and what they show of the hand.
 
-    `changes` are those of each fitted recording; `disagreement` as in `disagreements`. `remarks` tell
+    `changes` are those of each fitted recording; `discrepancy` as in `discrepancies`. `remarks` tell
     people what contradicts the rig.
     """
 
@@ -76,7 +76,7 @@ class Pool:
     fit: Fit
     sensing: Sensing
     changes: list[list[Change | None]] = field(default_factory=list)
-    disagreement: dict[tuple[Kind, int], Disagreement] = field(default_factory=dict)
+    discrepancy: dict[tuple[Kind, int], float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
     late: bool = False
 
@@ -91,7 +91,7 @@ def pooled(
     """
 
     def once(late: Sensing | None = None) -> tuple[list[Reading], Fit, Sensing]:
-        signals = (recorded.part(samples) for recorded, samples in parts)
+        signals = (part(recorded, samples) for recorded, samples in parts)
         signals = signals if late is None else (read_again(s, late) for s in signals)
         readings = [_read(s, rig, t) for s, t in zip(signals, taps, strict=True)]
         fitted = fit([readings[i].features for i in fitting], steps)
@@ -111,8 +111,8 @@ def pooled(
         contact_changes(readings[i].fine, readings[i].thinned, sensing, steps, fitted.parameters, alignment)
         for i, alignment in zip(fitting, fitted.posteriors, strict=True)
     ]
-    disagreement = disagreements([c for own in changes for c in own if c is not None])
-    return Pool(readings, fitted, sensing, changes, disagreement, remarks, late)
+    discrepancy = discrepancies([c for own in changes for c in own if c is not None])
+    return Pool(readings, fitted, sensing, changes, discrepancy, remarks, late)
 
 
 def _read(signals: Signals, rig: Rig, taps: Spans) -> Reading:
@@ -163,7 +163,7 @@ def aligned_rounds(
         pool = pooled(flat, fitting, steps, rig, taps)
     else:  # what is known of the sensors, and no alignment
         parameters = of[0].free.parameters
-        readings = [_read(r.part(p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
+        readings = [_read(part(r, p), rig, t) for (r, p), t in zip(flat, taps, strict=True)]
         pool = Pool(readings, Fit(parameters, ()), sense([], [], (), parameters, rig))
     position = {i: j for j, i in enumerate(fitting)}
     pieces = []
@@ -173,7 +173,7 @@ def aligned_rounds(
             continue
         alignment, changes = pool.fit.posteriors[position[i]], pool.changes[position[i]]
         found = boundary_posteriors(
-            changes, pool.disagreement, reading.thinned.t, alignment, reading.fine.touches
+            changes, pool.discrepancy, reading.thinned.t, alignment, reading.fine.touches
         )
         spans = to_spans(steps, found, *reading.ends)
         pieces.append(Piece(found, spans, None, float(alignment.log_evidence), *reading.ends))
@@ -193,7 +193,7 @@ def _rounds(
     cuts = [cut(f, task) for f in coarse]
     while True:
         every = [slices(r.t, at) for r, at in zip(recordings, cuts, strict=True)]
-        parts = [[features(thin(r.part(p), MAX_RATE), rig) for p in own]
+        parts = [[features(thin(part(r, p), MAX_RATE), rig) for p in own]
                  for r, own in zip(recordings, every, strict=True)]  # fmt: skip
         tasks = [own for p in parts for own in round_tasks(task, len(p))]
         found = iter(examine([f for own in parts for f in own], tasks))
@@ -222,7 +222,7 @@ def _departed(reading: Reading, steps: tuple[Subtask, ...], verdict: Conformity,
             reading.fine, reading.thinned, pool.sensing, shown.steps, own.parameters, alignment
         )
         found = boundary_posteriors(
-            changes, pool.disagreement, reading.thinned.t, alignment, reading.fine.touches
+            changes, pool.discrepancy, reading.thinned.t, alignment, reading.fine.touches
         )
     ends = reading.ends
     boundaries = task_boundaries(shown, found, len(steps), *ends)
@@ -357,7 +357,7 @@ def align(
         signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
     whole = [with_heights(s, trial, rig) for s, trial in zip(signals, trials, strict=True)]
     coarse = [features(thin(s, MAX_RATE), rig) for s in whole]
-    pool, pieces = aligned_rounds([InMemory(s) for s in signals], coarse, task, rig, all_fit)
+    pool, pieces = aligned_rounds(signals, coarse, task, rig, all_fit)
     done = performed(task, pieces)
     steps = subtasks(done)
     number = 1 if all_fit or done.repeat == "unknown" else done.repeat

@@ -254,21 +254,16 @@ def first_of(crossings: list[Crossing], width: float) -> np.ndarray:
     return (1 - UNIFORM) * first / first.sum() + UNIFORM / POINTS
 
 
-def combine(
-    t: np.ndarray, interval_probability: np.ndarray, densities: dict[int, np.ndarray]
-) -> BoundaryPosterior:
-    """Boundary posterior from the probability (T-1,) of each interval and densities within.
+def evenly(t: np.ndarray, interval_probability: np.ndarray) -> BoundaryPosterior:
+    """Boundary posterior from the probability (T-1,) of each interval, in which nothing more is known.
 
-    Intervals without a density of their own are uniform; those of probability below 1e-6 are
-    left out.
+    Intervals of probability below 1e-6 are left out.
     """
     u = (np.arange(POINTS) + 0.5) / POINTS
-    times, probabilities = [], []
-    for n in np.flatnonzero(interval_probability > 1e-6):
-        density = densities.get(int(n), np.full(POINTS, 1.0 / POINTS))
-        times.append(t[n] + u * (t[n + 1] - t[n]))
-        probabilities.append(interval_probability[n] * density)
-    return blurred(np.concatenate(times), np.concatenate(probabilities), t[0], t[-1])
+    likely = np.flatnonzero(interval_probability > 1e-6)
+    times = t[likely, None] + u * (t[likely + 1] - t[likely])[:, None]
+    masses = np.repeat(interval_probability[likely], POINTS)
+    return blurred(times.ravel(), masses, t[0], t[-1])
 
 
 def blurred(

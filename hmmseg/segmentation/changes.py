@@ -69,33 +69,27 @@ class Penetration:
     hidden: bool = False
 
 
-def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihoods (num_samples,) of contact and of none, p integrated out; a missing sensor adds nothing.
-
-    After the change forces are `louder` than their noise: in contact if it is made, apart if it is broken.
 
     What is more likely amiss differs: before a touch (`making`) the face may lie elsewhere, as a finger
     that came first pushes the block; after a release the force may ring.
     """
-    sd_pressed, sd_apart = (
-        c.sd_pressed * (louder if making else 1.0),
-        c.sd_apart * (1.0 if making else louder),
-    )
     force, position = np.isfinite(c.pressed), np.isfinite(c.place)
     pressed, place = np.where(force, c.pressed, 0.0), np.where(position, c.place, 0.0)
     log_force = np.log(2 * max(np.ptp(pressed), 10 * c.sd_pressed)) * force
     log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
-    pushes = np.where(force, log_ndtr(pressed / sd_pressed), 0.0) - log_force
-    silent = np.where(force, _log_student(pressed / sd_apart) - np.log(sd_apart), 0.0)
+    pushes = np.where(force, log_ndtr(pressed / c.sd_pressed), 0.0) - log_force
+    silent = np.where(force, _log_student(pressed / c.sd_apart) - np.log(c.sd_apart), 0.0)
     within = np.where(position, log_ndtr(place / c.sd_place), 0.0) - log_place
     beyond = np.where(position, log_ndtr(-place / c.sd_place), 0.0) - log_place
-    sd_force = np.hypot(sd_pressed, c.form * np.abs(pressed))
+    sd_force = np.hypot(c.sd_pressed, c.form * np.abs(pressed))
     both = np.hypot(sd_force, c.sd_place)
     depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = _log_student((pressed - place) / both) - np.log(both) - log_place
     # Both stories have a density of places alike. Where a place is so noisy that all that a contact moves by
     # is lost in it, that would count against contact, which force alone shows.
-    deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * sd_pressed)
+    deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * c.sd_pressed)
     agree = agree + np.log(max(ROOT_2PI * c.sd_place / deep, 1.0))
     held = agree + log_ndtr(depth * both / (sd_force * c.sd_place))
     held = np.where(force & position & (not c.hidden), held, pushes + within)
@@ -108,11 +102,9 @@ def log_contact(c: Penetration, making: bool, louder: float = 1.0) -> tuple[np.n
     return contact, none
 
 
-def switch_probability(
-    c: Penetration, log_prior: np.ndarray, making: bool, louder: float = 1.0
-) -> np.ndarray:
+def switch_probability(c: Penetration, log_prior: np.ndarray, making: bool) -> np.ndarray:
     """Probability (num_samples - 1,) that the contact is made, or broken, in each interval."""
-    contact, none = log_contact(c, making, louder)
+    contact, none = log_contact(c, making)
     before, after = (none, contact) if making else (contact, none)
     log_weight = np.cumsum(before)[:-1] + np.cumsum(after[::-1])[::-1][1:] + log_prior
     weight = np.exp(log_weight - log_weight.max())
@@ -155,19 +147,6 @@ class Prior:
         inside = (t >= self.limits[0]) & (t <= self.limits[1])
         with np.errstate(divide="ignore"):
             return np.log(out * inside)
-
-
-SEEN = 4.0  # prior: samples that the prior of forces no louder than their noise is worth
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """Model error of changes of one sort: `position` [m] that positions are allowed where there is contact;
-    `louder`: what forces are of their noise after a change, as they ring, or come late.
-    """
-
-    position: float = DISCREPANCY
-    louder: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -220,12 +199,12 @@ def cut(change: Change) -> Change | None:
     return replace(change, contacts=contacts)
 
 
-def disagreements(changes: Sequence[Change]) -> dict[tuple[Kind, int], Disagreement]:
-    """What the changes of each sort show of where force and position disagree."""
+def discrepancies(changes: Sequence[Change]) -> dict[tuple[Kind, int], float]:
+    """How far [m] positions may be off where there is contact, as the changes of each sort show."""
     by_sort: dict[tuple[Kind, int], list[Change]] = {}
     for change in changes:
         by_sort.setdefault(change.sort, []).append(change)
-    return {s: Disagreement(_discrepancy(own), _loudness(changes, s[1])) for s, own in by_sort.items()}
+    return {sort: _discrepancy(own) for sort, own in by_sort.items()}
 
 
 def _discrepancy(changes: Sequence[Change]) -> float:
@@ -249,29 +228,13 @@ def _discrepancy(changes: Sequence[Change]) -> float:
     return float(np.sqrt((apart.size * excess + KNOWN * DISCREPANCY**2) / (apart.size + KNOWN)))
 
 
-def _loudness(changes: Sequence[Change], num_contacts: int) -> float:
-    """What forces are of their noise where positions say for sure that there is no contact any more.
-
-    Those of contacts that were broken, of so many at once; a contact that is made rings alike.
-    """
-    broken = (c for c in changes if not c.making and len(c.contacts) == num_contacts)
-    z = [c.pressed[c.place < -SURE * c.sd_place] / c.sd_apart for change in broken for c in change.contacts]
-    z2 = np.concatenate([np.zeros(0), *z]) ** 2
-    z2 = z2[np.isfinite(z2)]
-    if not z2.size:
-        return 1.0
-    # Of a normal distribution; half of the samples may be anything.
-    excess = max(float(np.median(z2)) / 0.455 - 1.0, 0.0)
-    return float(np.sqrt(1.0 + z2.size * excess / (z2.size + SEEN)))
-
-
 # prior: that a grip ends when its force is silent, when it slides, when it has opened
 VIEWS = (0.6, 0.2, 0.2)
 FRICTION = 0.1  # prior: share by which friction differs from one contact to another
 
 
-def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
-    """Posterior of the moment of a change, with what is `known` of its sort.
+def moment(change: Change, discrepancy: float = DISCREPANCY) -> BoundaryPosterior:
+    """Posterior of the moment of a change, with the `discrepancy` [m] of its sort.
 
     A grip may be said to end when a pad's friction is spent and it begins to slide, when its force is first
     silent, or when fingers have opened as far as the pads were pressed: a pad that slides comes off and
@@ -279,7 +242,7 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
 
     Of two touches the later comes when both fingers are the block's width apart: the first pushes the block.
     """
-    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, known.position))) for c in change.contacts]
+    contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, discrepancy))) for c in change.contacts]
     views, weight = [contacts], (1.0,)
     if change.slips:
         sliding = [  # as far as they are deeper than where they slide
@@ -289,19 +252,17 @@ def moment(change: Change, known: Disagreement) -> BoundaryPosterior:
         ]  # fmt: skip
         opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
         views, weight = [contacts, sliding, opened], VIEWS
-    found, t = [_seen(view, change, known) for view in views], contacts[0].t
+    found, t = [_seen(view, change) for view in views], contacts[0].t
     sd = float(np.hypot(ONSET, change.timing))
     times = np.concatenate([times for times, _ in found])
     masses = np.concatenate([w * mass / mass.sum() for w, (_, mass) in zip(weight, found, strict=True)])
     return blurred(times, masses, float(t[0]), float(t[-1]), sd)
 
 
-def _seen(
-    contacts: Sequence[Penetration], change: Change, known: Disagreement
-) -> tuple[np.ndarray, np.ndarray]:
+def _seen(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, np.ndarray]:
     """Times [s] and masses of the moment at which contacts are made, or the first is broken."""
     t, making = contacts[0].t, change.making
-    found = np.array([switch_probability(c, change.log_prior, making, known.louder) for c in contacts])
+    found = np.array([switch_probability(c, change.log_prior, making) for c in contacts])
     combined = crossing_density if making else first_of
     inner = (np.arange(POINTS) + 0.5) / POINTS
     times, masses = [], []
@@ -310,7 +271,7 @@ def _seen(
         for chosen, mass in _shares(found, n, making):
             if mass < LIKELY:
                 continue
-            deciding = [_crossing(contacts[i], n, change, known) for i in chosen]
+            deciding = [_crossing(contacts[i], n, change) for i in chosen]
             density = combined(deciding if all(x.known for x in deciding) else [], width)
             if not np.isfinite(density).all():
                 density = combined([], width)
@@ -332,13 +293,12 @@ def _shares(found: np.ndarray, n: int, making: bool) -> list[tuple[tuple[int, ..
     return [((0, 1), float(a * b)), ((0,), float(a * done[1])), ((1,), float(b * done[0]))]
 
 
-def _crossing(c: Penetration, n: int, change: Change, known: Disagreement) -> Crossing:
+def _crossing(c: Penetration, n: int, change: Change) -> Crossing:
     """The crossing of interval n: by position where apart, by force where there is contact."""
     making, kind = change.making, change.kind
     touching, apart = (n + 1, n) if making else (n, n + 1)
     pressed, gap = c.pressed[touching], c.place[apart]
-    noise = c.sd_pressed * (known.louder if making else 1.0)
-    sd_pressed = float(np.hypot(noise, c.form * abs(pressed)))
+    sd_pressed = float(np.hypot(c.sd_pressed, c.form * abs(pressed)))
     if c.hidden:  # a rigid pad hides its compression
         pressed = max(c.place[touching], 0.0)
         sd_pressed = c.sd_place + 0.5 * abs(gap)

@@ -33,7 +33,7 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import SURE, TAIL, decisive
-from hmmseg.robust import NORMAL, median_of_known, robust_sd, weighted_median
+from hmmseg.robust import NORMAL, median_of_known, weighted_median
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
@@ -197,7 +197,6 @@ FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so ma
 BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
 REACH = 0.4  # numerics: s; free motion before and after a hold that is used: the longest delay, and a touch
 LEAST = 0.05  # chosen: information of a stretch, as a share of the best one's, to be used
-IMPLAUSIBLE = 3.0  # chosen: how much stiffer than stated no pad is
 LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
 LARGEST = 0.9  # chosen: quantile of what all contacts show, of friction or of ringing, that is the largest
 
@@ -330,47 +329,20 @@ def sense(
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
     timing, toe = lateness(felt, priors[0]), NONE
-    if timing.late and not _common(loads, timing, priors[1]):
-        timing = Lateness()
+    lead = 0.0 if timing.late else timing.delay
     if not (timing.late or again):  # forces that were late, or a wrist's, show no law so finely
-        toe = find([(*_read(s, timing), s.sd) for s in grips])
+        toe = find([(*reading(s, lead), s.sd) for s in grips])
         if toe is not NONE:  # what bends looks like what is late
-            grips, timing = [replace(s, toe=toe) for s in grips], Lateness()
-
-    def found() -> list[Compliance]:
-        return [_compliance([(*_read(s, timing), s.sd) for s in own], prior, float(r))
-                for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)]  # fmt: skip
-
-    normal, shear = found()
-    if timing.late and normal.value < priors[0][0] / IMPLAUSIBLE:  # noise that a delay happens to smooth away
-        timing = Lateness()
-        normal, shear = found()
+            grips, timing, lead = [replace(s, toe=toe) for s in grips], Lateness(), 0.0
+    normal, shear = (
+        _compliance([(*reading(s, lead), s.sd) for s in own], prior, float(r))
+        for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)
+    )
     normal = replace(normal, toe=toe)
     between = BETWEEN * float(np.median([np.median(np.diff(s.t)) for s in signals])) if timing.late else 0.0
     doubt = float(np.sqrt(timing.sd**2 + (LATE_SHARE * timing.delay * timing.late) ** 2 + between**2))
     friction = float(np.quantile(ratios, LARGEST)) if ratios else np.inf
     return Sensing(normal, shear, timing.delay, doubt, timing.late, timing.filter, friction)
-
-
-def _read(s: Stretch, timing: Lateness) -> tuple[np.ndarray, np.ndarray]:
-    """Loads and values at a delay; of its two ends, which say most, less than a sample leaves neither out."""
-    reach = 0.0 if timing.late else abs(timing.delay)
-    return reading(s, **{"constant" if timing.filter else "shift": timing.delay}, reach=reach)
-
-
-def _common(loads: Sequence[Stretch], timing: Lateness, prior: tuple[float, float]) -> bool:
-    """Whether loads in shear go with heights no worse for the delay that the grip shows."""
-    left = []
-    for each in (timing, Lateness()):
-        readings = [(*_read(s, each), s.sd) for s in loads]
-        straight = _compliance(readings, prior).value
-        rests = [place + straight * load for load, place, _ in readings if load.size > 3]
-        left.append(np.concatenate([np.zeros(0), *(rest - np.median(rest) for rest in rests)]))
-    if not all(each.size for each in left):
-        return True
-    scale = max(min(map(robust_sd, left)), min(s.sd for s in loads))
-    late, none = (float(np.log1p((each / scale) ** 2 / TAIL).mean()) for each in left)
-    return late <= none
 
 
 def _prior(compliance: float, stated: float) -> tuple[float, float]:

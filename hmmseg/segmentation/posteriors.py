@@ -13,8 +13,8 @@ from hmmseg.hand.signals import Signals, central_differences, one_sided
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known
-from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, combine, normal
-from hmmseg.segmentation.changes import Change, Disagreement, Penetration, Prior, cut, moment
+from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, evenly, normal
+from hmmseg.segmentation.changes import DISCREPANCY, Change, Penetration, Prior, cut, moment
 from hmmseg.segmentation.emissions import WINDOW, Parameters, noise_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.spans import Span
@@ -204,7 +204,7 @@ def contact_changes(
 
 
 def boundary_posteriors(
-    changes: Sequence[Change | None], known: Mapping[tuple[Kind, int], Disagreement], t: np.ndarray,
+    changes: Sequence[Change | None], discrepancy: Mapping[tuple[Kind, int], float], t: np.ndarray,
     posterior: AlignmentPosterior, touches: Touches = (),
 ) -> tuple[BoundaryPosterior, ...]:  # fmt: skip
     """Posterior of each boundary of one trial, aligned at t (num_timesteps,) [s].
@@ -214,9 +214,9 @@ def boundary_posteriors(
     found = []
     for k, change in enumerate(changes):
         if change is None:
-            found.append(combine(t, posterior.moves[0][:, k], {}))
+            found.append(evenly(t, posterior.moves[0][:, k]))
         else:
-            posted = moment(change, known.get(change.sort, Disagreement()))
+            posted = moment(change, discrepancy.get(change.sort, DISCREPANCY))
             found.append(nearest_touch(touches, posted) if len(change.contacts) > 1 else posted)
     return tuple(found)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,22 +25,6 @@ from hmmseg.segmentation.emissions import Features, thin
 from hmmseg.segmentation.free_contacts import FreeContacts, fit_free_contacts
 
 MARGIN = 64  # numerics: rows read on either side of a part, for differences of its neighbours
-
-
-@dataclass(frozen=True)
-class InMemory:
-    """Signals that are at hand."""
-
-    signals: Signals
-
-    @property
-    def t(self) -> np.ndarray:
-        """Times (num_timesteps,) [s]."""
-        return self.signals.t
-
-    def part(self, samples: slice) -> Signals:
-        """Signals of some samples."""
-        return part(self.signals, samples)
 
 
 class OnDisk:
@@ -58,9 +42,8 @@ class OnDisk:
         """Times (num_timesteps,) [s]."""
         return self.recording.t
 
-    def part(self, samples: slice) -> Signals:
-        """Signals of some samples."""
-        start, stop = samples.start, samples.stop
+    def read(self, start: int, stop: int) -> Signals:
+        """Signals of the samples from `start` to `stop`."""
         low, high = max(start - MARGIN, 0), min(stop + MARGIN, self.t.size)
         signals = task_space(self.recording.rows(low, high), self.rig)
         if self._late:
@@ -73,14 +56,14 @@ class OnDisk:
         step = group_size(rate, max_rate)
         size = max(self.recording.piece // step, 1) * step
         pieces = [
-            thin(self.part(slice(start, min(start + size, self.t.size))), max_rate, rate=rate)
+            thin(self.read(start, min(start + size, self.t.size)), max_rate, rate=rate)
             for start in range(0, self.t.size, size)
         ]
         arrays = [name for name, value in vars(pieces[0]).items() if isinstance(value, np.ndarray)]
         return replace(pieces[0], **{n: np.concatenate([getattr(p, n) for p in pieces]) for n in arrays})
 
 
-Recorded = InMemory | OnDisk
+Recorded = Signals | OnDisk
 GLANCE = 4096  # numerics: samples that identify the recording's blocks with objects
 
 
@@ -150,10 +133,12 @@ def slices(t: np.ndarray, cuts: Sequence[float]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
 
-def part(signals: Signals, samples: slice) -> Signals:
+def part(recorded: Recorded, samples: slice) -> Signals:
     """A stretch of a recording."""
-    sliced = {k: v[samples] for k, v in vars(signals).items() if isinstance(v, np.ndarray)}
-    return replace(signals, **sliced)
+    if isinstance(recorded, OnDisk):
+        return recorded.read(samples.start, samples.stop)
+    sliced = {k: v[samples] for k, v in vars(recorded).items() if isinstance(v, np.ndarray)}
+    return replace(recorded, **sliced)
 
 
 def merge_point(verdicts: Sequence[Conformity], times: Sequence[np.ndarray]) -> int | None:

@@ -1,4 +1,4 @@
-"""Stretches at rest of a recording: loads and what they do to pads, read with forces late or filtered.
+"""Stretches at rest of a recording: loads and what they do to pads.
 
 A rounded or a soft tip meets its block with a small patch that grows as it is pressed, so that the first
 tenth of a newton moves it further than the last (Hertz 1882; fingertips of flesh and of rubber alike:
@@ -14,14 +14,13 @@ contacts is no curvature; the depth is common to all.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.levels import MOVED, SURE, TAIL, decisive
-from hmmseg.robust import bridged, median_of_known, robust_sd
+from hmmseg.robust import median_of_known, robust_sd
 from hmmseg.segmentation.emissions import Parameters, noise_sd
 
 
@@ -136,24 +135,17 @@ RINGS = 0.3  # chosen: s after a release in which a contact still rings
 class Stretch:
     """Samples (N,) at rest: times t [s] and loads [N] in contact; value at any time.
 
-    `before` [N] are the loads `step` [s] earlier. `place` (M,) is the value at `clock` (M,) [s],
-    `sd` [m] its noise. Loads above `sure` [N] are of contact. A contact with a `toe` is read as if straight.
+    `interval` [s]: median time between samples. `place` (M,) is the value at `clock` (M,) [s], `sd` [m] its
+    noise. A contact with a `toe` is read as if straight.
     """
 
     t: np.ndarray
     load: np.ndarray
-    before: np.ndarray
-    step: np.ndarray
+    interval: float
     clock: np.ndarray
     place: np.ndarray
     sd: float
-    sure: float
     toe: Toe = NONE
-
-    @cached_property
-    def interval(self) -> float:
-        """Median time between samples [s]."""
-        return float(np.median(self.step))
 
 
 def stretches(
@@ -172,22 +164,20 @@ def stretches(
     resting = fy < min(SUPPORTED * weight, weight - 3 * noise)
     pressing = inside & (fx1 > SURE * sd_force) & (-fx2 > SURE * sd_force)
     out = []
-    for load, value, stated, within, sure in (
-        (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True, 2 * SURE * sd_force),
-        (-fy / 2, s.y, s.sd_y / np.sqrt(2), resting, -np.inf),
+    for load, value, stated, within in (
+        (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True),
+        (-fy / 2, s.y, s.sd_y / np.sqrt(2), resting),
     ):
         use = pressing & within & np.isfinite(load)
         there = np.isfinite(value)
         if use.sum() < 4 or there.sum() < 4:
             out.append(None)
             continue
-        filled = bridged(load, s.t)
-        before, step = np.r_[filled[0], filled[:-1]], np.diff(s.t, prepend=2 * s.t[0] - s.t[1])
+        interval = float(np.median(np.diff(s.t, prepend=2 * s.t[0] - s.t[1])[use]))
         sd, t = median_of_known(stated), s.t[use]
         sd = noise_sd(value) if np.isnan(sd) else sd
         there &= (s.t >= t[0] - FARTHEST) & (s.t <= t[-1] + FARTHEST)
-        out.append(Stretch(t, load[use], before[use], step[use], s.t[there], value[there],
-                           max(sd, 1e-9), sure))  # fmt: skip
+        out.append(Stretch(t, load[use], interval, s.t[there], value[there], max(sd, 1e-9)))
     return out[0], out[1]
 
 
@@ -225,32 +215,18 @@ def ringing(s: Signals, start: float, end: float, p: Parameters) -> list[tuple[f
     return [(float(np.hypot(x1, x2)), float(np.hypot(y1, y2)) / 2, float(np.hypot(swing1, swing2)))]
 
 
-def unfiltered(s: Stretch, constant: float) -> Stretch:
-    """The stretch with the first-order filter of this time `constant` [s] of its loads undone.
+def reading(s: Stretch, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Loads and values (M,) that belong together for forces `shift` s late.
 
-    Exact for an input that is steady within each sample interval, whose middle the result belongs to.
+    Loads are interpolated to the times of the values, whose noise matters more; up to the shift beyond the
+    first and the last of them, which say most, they are extrapolated. A contact with a toe is read as if it
+    were straight.
     """
-    kept = np.exp(-s.step / constant)
-    load = (s.load - kept * s.before) / (1 - kept)
-    # A filtered force lingers after its contact.
-    there = load > s.sure * np.sqrt(1 + kept**2) / (1 - kept)
-    return replace(s, t=(s.t - s.step / 2)[there], load=load[there])
-
-
-def reading(
-    s: Stretch, shift: float = 0.0, constant: float = 0.0, reach: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Loads and values (M,) that belong together for forces `shift` s late, or filtered.
-
-    Loads are interpolated to the times of the values, whose noise matters more; up to `reach` [s] beyond the
-    first and the last of them they are extrapolated. A contact with a toe is read as if it were straight.
-    """
-    s = unfiltered(s, constant) if constant > 0 else s
     t, late = s.t, s.clock + shift
     if t.size < 2:
         return np.zeros(0), np.zeros(0)
     after = np.clip(np.searchsorted(t, late), 1, t.size - 1)
-    step, edge = np.diff(t)[after - 1], reach + 1e-9
+    step, edge = np.diff(t)[after - 1], abs(shift) + 1e-9
     # A straight line between two loads, and beyond the first and the last.
     load = s.load[after - 1] + (s.load[after] - s.load[after - 1]) * ((late - t[after - 1]) / step)
     within = (late >= t[0] - edge) & (late <= t[-1] + edge) & (step < 1.5 * s.interval)

@@ -11,10 +11,12 @@ import numpy as np
 from hmmseg.errors import InputError
 from simgap.attribution.heldout import (
     POSITIVE,
+    RESPONSE,
     Heldout,
     HowFar,
     residual_left,
     scatter_between,
+    share_of,
 )
 from simgap.attribution.posterior import Forms, Model, channel_of, coordinates, fitted, forms
 from simgap.attribution.problem import Gap, Rows
@@ -201,10 +203,9 @@ def attribute(
     p_rest = detected(statistic(f, models, causes)).p_value
     explained = shares(f, model, by_group, rng)
     # Noise that differs from part to part can show a gap somewhere, and none in all squares together.
-    apart = verdict.verdict == "none" or (causes and all(f.gap.candidates[j].apart for j in causes))
-    shown = explained.before > explained.floor or apart
+    shown = explained.before > explained.floor or verdict.verdict == "none"
     remains = explained.remainder if shown else 1.0
-    far = _how_far(f, others, causes)
+    far = None if others is None else others.how_far(causes)
     chance = acting([Explanation(_names(f, m.effects), float(x)) for m, x in zip(models, w, strict=True)],
                     found.p_value)  # fmt: skip
     somewhere = verdict.verdict != "none" or small is not None
@@ -287,31 +288,23 @@ def _examined(
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
     causes = tuple(j for j in effects if j in scattering or _needed(f, model, j))
-    apart = {j for j in effects if f.gap.candidates[j].apart}
     if others is not None:
-        causes = _predicting(others, causes, apart)
+        causes = _predicting(others, causes)
     shifting = {*causes} - scattering
     left = explained.inside if shifting else 0.0
-    far = _how_far(f, others, causes)
+    far = None if others is None else others.how_far(causes)
     share = 1 - explained.remainder if far is None else far.fraction
-    if far is None and others is not None and shifting - apart:
+    if far is None and others is not None and shifting:
         share = 0.0  # squares in all are no more than the noise's: there is nothing that could be gone
     sure = known(left, share, detected(statistic(f, models, causes)).p_value) if causes else 0.0
     return _Examined(effects, model, explained, causes, sure)
 
 
-def _how_far(f: Forms, others: Heldout | None, causes: tuple[int, ...]) -> HowFar | None:
-    """How far causes shrink the gap of trials that took no part, if these can bear on any of them."""
-    apart = all(f.gap.candidates[j].apart for j in causes)
-    return None if others is None or apart else others.how_far(causes)
-
-
-def _predicting(others: Heldout, causes: tuple[int, ...], apart: set[int]) -> tuple[int, ...]:
-    """Those causes without which trials that took no part are predicted worse, taken out one by one, and what
-    is `apart` from all trials."""
-    while judged := {*causes} - apart:
-        rest = {j: [i for i in causes if i != j] for j in judged}
-        gains = {j: others.gain(causes, rest[j], rest[j]) for j in judged}
+def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
+    """Those causes without which trials that took no part are predicted worse, taken out one by one."""
+    while causes:
+        rest = {j: [i for i in causes if i != j] for j in causes}
+        gains = {j: others.gain(causes, rest[j], rest[j]) for j in causes}
         least = min(gains, key=lambda j: gains[j])
         if gains[least] > POSITIVE:
             break
@@ -354,8 +347,9 @@ def _effects(
         own = coordinates(f, model.effects)[j]
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
-        # Parts are compared for effects of the sets that were examined alone.
-        wide = sd if found is None else np.hypot(sd, c.scale * np.sqrt(_between(f, model, j)))
+        wide = np.hypot(sd, c.scale * RESPONSE * share_of(f, model, j))
+        if found is not None:  # parts are compared for effects of the sets that were examined alone
+            wide = np.hypot(wide, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,
             {n: ParameterPosterior(float(m), float(s), (float(m - 1.645 * s), float(m + 1.645 * s)))

@@ -19,9 +19,18 @@ from simgap.bounded import least
 # meta-analysis (DerSimonian & Laird, Controlled Clinical Trials 7, 1986) with its heterogeneity on a grid.
 
 WANDER = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5])  # prior: shares of the parameters
+RESPONSE = 0.03  # prior: of a parameter: by how much an effect's form answers it wrongly everywhere alike
 SINGULAR = 1e-12  # numerics: share of the largest eigenvalue below which a direction is unknown
 # cited: nats; "positive" evidence for one cause (Kass & Raftery, JASA 90, 1995)
 POSITIVE = float(np.log(3.0))
+
+
+def share_of(f: Forms, model: Model, effect: int) -> np.ndarray:
+    """What a share of each of an effect's parameters (k,) is a share of, in deviations over scale: its own
+    size where that is stated, else all of them together."""
+    c, x = f.gap.candidates[effect], model.x[coordinates(f, model.effects)[effect]]
+    usual = np.full(x.size, float(np.sqrt(x @ x)))
+    return usual if c.size is None else np.where(np.isfinite(c.size), c.size / c.scale, usual)
 
 
 def scatter_between(f: Forms, model: Model, effect: int, part: np.ndarray) -> np.ndarray:
@@ -98,6 +107,8 @@ def form_error(f: Forms, model: Model) -> np.ndarray:
 # with mean and covariance of x (nuisances and parameters) given the other trials. Where the model holds, S
 # has the expectation n, the number of rows. A nuisance of one trial is free again in the trial that is
 # predicted: the others say nothing of it. Both squares, with causes and without, are taken in the same way.
+# What is known of nuisances beforehand, as a property that was measured apart, counts as one more trial: all
+# trials together predict it.
 
 
 @dataclass(frozen=True)
@@ -127,13 +138,16 @@ class HowFar:
 class Heldout:
     """Every trial predicted by the others; `noise` (channels,): variance of each channel's noise.
 
-    `among`: the gap's candidates that sets are made of; `folds`: the others and the trial, of these alone;
-    `computed`: squares (K,) and log determinants (K,) of sets so far.
+    `among`: the gap's candidates that sets are made of; `whole`: all trials, `folds`: the others and the
+    trial, of these candidates alone; `evidence` [nats] of all candidates, besides their rows; `computed`:
+    squares (K + 1,) and log determinants (K + 1,) of sets so far.
     """
 
     noise: np.ndarray
     among: tuple[int, ...]
+    whole: Forms
     folds: tuple[tuple[Forms, Forms], ...]
+    evidence: tuple[float, ...]
     computed: dict[tuple[tuple[int, ...], ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @classmethod
@@ -143,28 +157,34 @@ class Heldout:
         if trials.size < 2:
             return None
         among = tuple(sorted(set(among)))
-        gap, inside = gap.only(among), [gap.rows.trial == trial for trial in trials]
-        return cls(noise, among, tuple((forms(gap.taken(~one)), forms(gap.taken(one))) for one in inside))
+        few, inside = gap.only(among), [gap.rows.trial == trial for trial in trials]
+        folds = tuple((forms(few.taken(~one)), forms(few.taken(one))) for one in inside)
+        return cls(noise, among, forms(few), folds, tuple(c.evidence for c in gap.candidates))
 
     def how_far(self, effects: Sequence[int]) -> HowFar | None:
         """How far a set of effects shrinks the gap; None where these trials have no excess of squares."""
         (before, _), (after, _) = self._squares(()), self._squares(effects)
-        floor = np.array([test.count.sum() for _, test in self.folds])
+        plain, z = fitted(self.whole, ()), self.whole.spectrum.num_nuisances
+        known = z - float(np.trace(plain.covariance))
+        floor = np.array([*(test.count.sum() for _, test in self.folds), known])
         if float((before - floor).sum()) <= 0:
             return None
         n, gone = float(floor.sum()), fraction_gone(before - after, before - floor)
         return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *gone, self.gain(effects, ()))
 
     def gain(self, effects: Sequence[int], without: Sequence[int], off: Sequence[int] = ()) -> float:
-        """Log predictive density of all trials by a set of effects over that by another [nats]; forms of the
-        effects that may be `off` are no better than they usually are."""
+        """Log predictive density of all trials by a set of effects over that by another [nats], and what else
+        speaks for them; forms of the effects that may be `off` are no better than they usually are."""
         (more, wide), (less, plain) = self._squares(effects, off), self._squares(without, off)
-        return 0.5 * float((less + plain - more - wide).sum())
+        known = [sum(self.evidence[j] for j in which) for which in (effects, without)]
+        return 0.5 * float((less + plain - more - wide).sum()) + known[0] - known[1]
 
     def _squares(self, effects: Sequence[int], off: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
         key, loose = (tuple(sorted(self.among.index(j) for j in which)) for which in (effects, off))
         if (key, loose) not in self.computed:
-            each = np.array([self._predicted(train, test, key, loose) for train, test in self.folds])
+            x = fitted(self.whole, key).x[: self.whole.spectrum.num_nuisances]
+            each = [self._predicted(train, test, key, loose) for train, test in self.folds]
+            each = np.array([*each, (float(x @ x), 0.0)])
             self.computed[key, loose] = each[:, 0], each[:, 1]
         return self.computed[key, loose]
 
@@ -191,7 +211,8 @@ def fraction_gone(gone: np.ndarray, there: np.ndarray) -> tuple[float, tuple[flo
     """Share of the gap that is gone, of what is `gone` and what was `there` in K parts (K,), and its 90 %
     interval by the jackknife of a ratio (Tukey, Ann. Math. Stat. 29, 1958)."""
     k, fraction = gone.size, min(float(gone.sum() / there.sum()), 1.0)
-    others = (gone.sum() - gone) / np.maximum(there.sum() - there, 1e-9)
+    rest = there.sum() - there
+    others = np.where(rest > 0, (gone.sum() - gone) / np.where(rest > 0, rest, 1.0), fraction)
     sd = float(np.sqrt((k - 1) / k * ((others - others.mean()) ** 2).sum()))
     wide = float(student.ppf(0.95, k - 1)) * sd
     return fraction, (fraction - wide, min(fraction + wide, 1.0))

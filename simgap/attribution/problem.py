@@ -65,8 +65,7 @@ class Candidate:
     parameters that may be others in every part, as phases of an oscillation are. `size` (k,): what a share of
     a parameter is a share of; its deviation from neutral where that is not given, or not finite.
     `frees` (n,): by how much, at most, the variance of cosine coefficients of cells may be larger
-    where it acts, in units of the noise's. `apart`: whether it is about a measurement apart from the trials,
-    which no trial held out can bear on.
+    where it acts, in units of the noise's.
     """
 
     name: str
@@ -84,7 +83,6 @@ class Candidate:
     hidden: tuple[str, ...] = ()
     size: Float[np.ndarray, " k"] | None = None
     frees: np.ndarray | None = None
-    apart: bool = False
 
     def taken(self, rows: np.ndarray) -> Candidate:
         """The candidate on some rows."""
@@ -92,7 +90,7 @@ class Candidate:
         return Candidate(self.name, self.parameters, self.at, self.neutral, self.scale, self.shift[rows],
                          self.jacobian[rows], self.low, self.high, variance, self.evidence,
                          self.form, self.hidden, self.size,
-                         None if self.frees is None else self.frees[rows], self.apart)  # fmt: skip
+                         None if self.frees is None else self.frees[rows])  # fmt: skip
 
 
 @dataclass(frozen=True)

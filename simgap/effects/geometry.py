@@ -261,7 +261,7 @@ def _scatter_hand_roll(given, residual: np.ndarray):
         square[at] = np.asarray(dct(residual[at], norm="ortho")) ** 2
     if not (unit > 0).any():
         return None
-    found = on_grid("hand_roll", square, unit, ROLLS, rows.cell, VARIED)
+    found = on_grid("hand_roll", square, given.nuisances.kept(rows, unit), ROLLS, rows.cell, VARIED)
     # Its size and speed in each carry are unknown: what lies there has its own variance.
     return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
 

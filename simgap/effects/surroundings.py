@@ -75,7 +75,7 @@ def _wrong_actual(given, push: np.ndarray) -> list:
                 usual = np.full(1, WRONG * abs(given.centre[o, k]) / given.sd[o, k])
                 out.append(Candidate(ACTUAL.name, (f"{name}.{kind}",), nothing, nothing, usual,
                                      np.zeros(len(push)), -column[:, None], np.full(1, -np.inf),
-                                     np.full(1, np.inf), apart=True))  # fmt: skip
+                                     np.full(1, np.inf)))  # fmt: skip
     return out
 
 

@@ -320,18 +320,12 @@ def together(
     gap = replace(gap, candidates=tuple(anew.get(c.name, c) for c in gap.candidates))
     if len(joint.effects) < 2:
         return gap
-    own = _joint(given, healthy, joint)
-    more = replace(gap, candidates=(*gap.candidates, *own))
-    if gap.carried is None:
-        return more
-    kept = gap.carried.shape[2]
 
-    def on(other: Problem) -> np.ndarray:
-        shaken = _joint(other, on_other(other, healthy), on_other(other, joint))
-        return replace(more, candidates=(*gap.candidates, *shaken)).raw_columns[:, kept:]
+    def of(problem: Problem, healthy: Fitted, joint: Fitted) -> Gap:
+        return replace(gap, candidates=(*gap.candidates, *_joint(problem, healthy, joint)))
 
-    noise = carried(more.raw_columns[:, kept:], redrawn, on)
-    return replace(more, carried=np.concatenate([gap.carried, noise], 2))
+    return _carrying(gap, of(given, healthy, joint), redrawn,
+                     lambda other: of(other, on_other(other, healthy), on_other(other, joint)))  # fmt: skip
 
 
 def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
@@ -354,6 +348,48 @@ def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
                               joint.push[:, at : at + len(free)], doubts))  # fmt: skip
         at += len(free)
     return out
+
+
+def after(
+    given: Problem, gap: Gap, healthy: Fitted, first: Fitted, joint: Sequence[Fitted],
+    redrawn: Sequence[Problem],
+) -> Gap:  # fmt: skip
+    """The gap with further candidates: the last effects of joint fits, linearised after the `first` one.
+
+    Each shifts the residual by what its fit takes off beyond what the first does there.
+    """
+
+    def of(problem: Problem, healthy: Fitted, first: Fitted, joint: Sequence[Fitted]) -> Gap:
+        k, own = problem.num_properties, []
+        start = healthy.residual - healthy.push @ healthy.u[:k]
+        one = _shifting(problem, first, start, healthy.push, healthy.doubts)
+        for f in joint:
+            both = start - (f.residual - healthy.push @ f.u[:k])
+            known = one.shift + one.jacobian @ (f.u[first.columns[k:]] - one.at)
+            mine = slice(first.columns.size, None)
+            own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - known,
+                                  f.push[:, mine], f.doubts - first.doubts))  # fmt: skip
+        return replace(gap, candidates=(*gap.candidates, *own))
+
+    def on(other: Problem) -> Gap:
+        plain = on_other(other, healthy)
+        return of(other, plain, *_alike(other, plain, first), [*_alike(other, plain, *joint)])
+
+    return _carrying(gap, of(given, healthy, first, joint), redrawn, on)
+
+
+def _alike(other: Problem, healthy: Fitted, *fits: Fitted) -> list[Fitted]:
+    """Fits on another recording, where the `healthy` one is known."""
+    return [on_other(other, f, healthy.push) for f in fits]
+
+
+def _carrying(gap: Gap, more: Gap, redrawn: Sequence[Problem], on: Callable[[Problem], Gap]) -> Gap:
+    """A gap with `more` candidates, and with what sensors' noise makes of these."""
+    if gap.carried is None:
+        return more
+    kept = gap.carried.shape[2]
+    noise = carried(more.raw_columns[:, kept:], redrawn, lambda other: on(other).raw_columns[:, kept:])
+    return replace(more, carried=np.concatenate([gap.carried, noise], 2))
 
 
 def _turning(given: Problem, angle: float) -> np.ndarray:

@@ -14,26 +14,27 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
-from simgap.attribution.posterior import Model, forms
-from simgap.attribution.problem import Gap
-from simgap.attribution.search import sought
+from simgap.attribution.posterior import Model, fitted, forms
+from simgap.attribution.problem import Candidate, Gap
+from simgap.attribution.search import detected, sought, statistic
 from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
-from simgap.effects import catalogue, effect_named, free_parameters, name_of
+from simgap.effects import catalogue, effect_named, forms_of, free_parameters, name_of
 from simgap.effects.base import World, tips
-from simgap.gap.assemble import scatters, together
+from simgap.gap.assemble import after, scatters, together
 from simgap.gap.experiments import next_experiment
 from simgap.gap.frame import CHANNELS, check_forced, of_wrist
 from simgap.gap.problem import (
     Fitted,
     Problem,
     Start,
+    columns_of,
     fit,
     properties_tolerated,
     raw_residual_at,
     residual_at,
     world_without,
 )
-from simgap.gap.search import Identified, Search, search
+from simgap.gap.search import PROMISING, Identified, Search, best_fit, search
 from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.progress import Progress, silent
 from simgap.report.finding import sentence, tables
@@ -382,33 +383,54 @@ def attributed(
     """The attribution of a search, effects that act together linearised where they do."""
     gap = found.gap
     models: list[Model] | None = sought(forms(gap))
-    leading = [j for j in models[0].effects if j < len(found.fits)]
-    if leading and not forced:
-        joint = _together(found, leading)
-        left = scatters(
-            found.problem, found.problem.nuisances.left(joint.residual), [s.effect for s in found.scatters]
-        )
-        gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
+    if not forced:
+        gap, models = _after_first(found, gap, models)
+        leading = [c for j in models[0].effects if _shifts_signals(c := gap.candidates[j])]
+        if leading:
+            joint = _together(found, leading)
+            left = scatters(
+                found.problem, found.problem.nuisances.left(joint.residual),
+                [s.effect for s in found.scatters],
+            )  # fmt: skip
+            gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
 
 
-def _together(found: Search, which: Sequence[int]) -> Fitted:
-    """Some of the fits joined: fitted together from where each is by itself."""
-    u = found.healthy.u.copy()
-    for j in which:
-        own = found.fits[j].columns[found.problem.num_properties :]
-        u[own] = found.fits[j].u[own]
-    return fit(found.problem, Start(tuple(found.fits[j].effects[0] for j in which), u))
+def _after_first(found: Search, gap: Gap, models: list[Model]) -> tuple[Gap, list[Model]]:
+    """The gap and its sets with every effect fitted after the first of the leading set, where this one alone
+    leaves a gap: what another distorts looks like others by itself."""
+    f, best = forms(gap), models[0]
+    shifting = [j for j in best.effects if _shifts_signals(gap.candidates[j])]
+    if not shifting:
+        return gap, models
+    first = min(shifting, key=lambda j: fitted(f, tuple(i for i in best.effects if i != j)).score)
+    if len(best.effects) == 1 and detected(statistic(f, models, best.effects)).p_value >= ALARM:
+        return gap, models
+    one = found.fits[first]
+    keys = [k for each in found.fits if name_of(k := each.effects[0]) != gap.candidates[first].name]
+    fits = [best_fit(found.problem, key, one) for key in keys]
+    promising = [each for each in fits if each.cost < one.cost - PROMISING]
+    gap = after(found.problem, gap, found.healthy, one, promising, found.redrawn)
+    return gap, sought(forms(gap))
+
+
+def _shifts_signals(c: Candidate) -> bool:
+    """Whether a candidate shifts signals, rather than scattering them or being about a measurement."""
+    return bool(c.parameters) and catalogue()[c.name].correct is not None
+
+
+def _together(found: Search, which: Sequence[Candidate]) -> Fitted:
+    """Some candidates joined: fitted together from where each was linearised."""
+    u, keys = found.healthy.u.copy(), []
+    for c in which:
+        keys.append(next(key for key in forms_of(c.name) if free_parameters(key) == c.parameters))
+        u[columns_of(found.problem, keys[-1:])[found.problem.num_properties :]] = c.at
+    return fit(found.problem, Start(tuple(keys), u))
 
 
 def _causes(found: Search, gap: Gap, verdict: Attribution) -> Fitted:
     """The fit of the verdict's effects that shift signals, in the forms that they were found in."""
-    which = []
-    for name in verdict.causes:
-        parameters = gap.candidates[verdict.effects[name].candidate].parameters
-        which += [
-            j for j, f in enumerate(found.fits)
-            if name_of(f.effects[0]) == name and free_parameters(f.effects[0]) == parameters
-        ]  # fmt: skip
-    return _together(found, which) if which else found.healthy
+    named = [gap.candidates[verdict.effects[name].candidate] for name in verdict.causes]
+    shifting = [c for c in named if _shifts_signals(c)]
+    return _together(found, shifting) if shifting else found.healthy

@@ -132,14 +132,14 @@ def without_dropouts(trial: Trial) -> Trial:
     return replace(trial, channels=channels)
 
 
-def thinned(trial: Trial, rig: Rig) -> tuple[Trial, int]:
-    """The trial averaged down to MAX_RATE at most, and how many samples went into one.
+def thinned(trial: Trial, rig: Rig, rate: float = MAX_RATE) -> tuple[Trial, int]:
+    """The trial averaged down to a `rate` [Hz] at most, and how many samples went into one.
 
     Lost readings are left out. Angles and their rates are those of the tips' mean positions and velocities:
     a finger that moves quickly is not where its mean angles are.
     """
     trial = without_dropouts(trial)
-    group = group_size(trial.rate, MAX_RATE)
+    group = group_size(trial.rate, rate)
     if group <= 1:
         return trial, 1
     inertia = None if trial.inertia is None else grouped(trial.inertia, group)[0]
@@ -210,7 +210,7 @@ def trial_arrays(
     there[np.ix_(_struck(force, sample["force"]), np.isin(CHANNELS, ("vx", "vy")))] = 0.0
     lone = _one_finger(t, force, subtask, free, boundaries, sample["force"])
     there[lone, FORCES] = 0.0
-    there[_opening(signals, force, subtask, free, rig), GRIP_FORCE] = 0.0
+    there[_opening(signals, force, free), GRIP_FORCE] = 0.0
     carried = np.array([phase_of(s) == Phase.CARRY for s in steps])
     lifts = carried[1:] != carried[:-1]  # a block leaves its support or meets one
     either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
@@ -282,19 +282,22 @@ def _one_finger(
     return out
 
 
-def _opening(
-    signals: Signals, force: np.ndarray, subtask: np.ndarray, free: np.ndarray, rig: Rig
-) -> np.ndarray:
+def _opening(signals: Signals, force: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Samples (N,) right after a grip at which fingers are not yet as far apart as pads without load are.
 
-    Pads come back late: fingers that open lose the block while they are still nearer than it is wide.
+    Pads come back late: fingers that open lose the block while they are still nearer than it is wide. How far
+    apart unloaded pads are is what the grip's own distances tend to as its force does to nothing, whatever
+    the pads' stiffness.
     """
-    out, pad = np.zeros(free.size, bool), rig.fingertip
-    distance = signals.x2 - signals.x1
-    unloaded = distance + (force[:, 0] - force[:, 2]) / pad.normal_stiffness
-    for start in np.flatnonzero(free[1:] & ~free[:-1]) + 1:
-        nearer = distance[start:] < np.nanmedian(unloaded[subtask == subtask[start - 1]])
-        out[start : start + int(np.argmin(np.append(nearer & free[start:], False)))] = True
+    out, distance, squeeze = np.zeros(free.size, bool), signals.x2 - signals.x1, force[:, 0] - force[:, 2]
+    ends = np.flatnonzero(free[1:] & ~free[:-1]) + 1
+    for start, end in zip(np.flatnonzero(~free & np.roll(free, 1)), ends, strict=False):
+        grip = np.arange(start, end)[np.isfinite(distance[start:end])]
+        if np.ptp(squeeze[grip]) == 0:
+            continue
+        unloaded = np.polyfit(squeeze[grip], distance[grip], 1)[1]
+        nearer = (distance[end:] < unloaded) & free[end:]
+        out[end : end + int(np.argmin(np.append(nearer, False)))] = True
     return out
 
 

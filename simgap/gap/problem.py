@@ -11,6 +11,7 @@ import numpy as np
 
 from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
 from hmmseg.contact.decompose import PROPERTIES
+from simgap.attribution.problem import Rows, cosines
 from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.effects import catalogue, free_parameters, name_of
@@ -60,6 +61,14 @@ class Nuisances:
         """What they leave of a residual (n,), each at its likeliest value."""
         basis, taken = self._basis
         return residual - basis @ (taken * (basis.T @ residual))
+
+    def kept(self, rows: Rows, variance: np.ndarray) -> np.ndarray:
+        """What they leave of independent cosine coefficients with these variances (n,)."""
+        mine, (basis, taken) = np.flatnonzero(variance > 0), self._basis
+        few = cosines(rows, basis)[0][mine]
+        out = np.zeros(variance.size)
+        out[mine] = np.square(np.eye(mine.size) - (few * taken) @ few.T) @ variance[mine]
+        return out
 
 
 # prior: what measured weight (share), width, height [m] may be off in addition to their own sd

@@ -57,8 +57,8 @@ def shifting(names: Sequence[str]) -> list[str]:
     return [key for n in names if catalogue()[n].correct is not None for key in forms_of(n)]
 
 
-def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
-    """Starts of one form of an effect, from other coordinates `base` (all columns)."""
+def starts(given: Problem, key: str, others: tuple[str, ...], base: np.ndarray) -> list[Start]:
+    """Starts of one form of an effect after `others`, from other coordinates `base` (all columns)."""
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     grids = [
         [(slot.start + j, p.coordinate(value)) for value in p.starts]
@@ -70,34 +70,35 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[Start]:
         u = base.copy()
         for column, value in chosen:
             u[column] = value
-        out.append(Start((key,), u))
+        out.append(Start((*others, key), u))
     return out
 
 
 def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMISING) -> Fitted:
-    """The best fit of one form of an effect, properties refitted; not refined where a linear step gains less
-    than what is `promising` [nats].
+    """The best fit of one form of an effect, properties and the effects of `healthy` refitted; not refined
+    where a linear step gains less than what is `promising` [nats].
 
     Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
-    what swings with it has no size. Properties start as they were measured: without the effect they may have
-    been drawn far off.
+    what swings with it has no size. Properties start as they were measured, for without the effect they may
+    have been drawn far off, and from where they are, for fingers that are off may seem to touch blocks.
     """
-    base = healthy.u.copy()
+    base, usual = healthy.u.copy(), healthy.push[:, : given.num_properties]
     base[: given.num_properties][given.measured.ravel()] = 0.0
-    every, usual = starts(given, key, base), healthy.push
+    drawn = np.abs(healthy.u - base).max() > 1  # by more than their standard deviation
+    every = [s for u in (base, healthy.u)[: 1 + drawn] for s in starts(given, key, healthy.effects, u)]
     ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < promising:
         return fit(given, ranked[0][2], 0, usual)
     leading = [start for _, start, _ in ranked[:LEADERS]]
     if len(leading) > 1:
         screened = sorted((fit(given, s, SCREEN, usual) for s in leading), key=lambda f: f.cost)
-        leading = [Start((key,), screened[0].u)]
+        leading = [Start(screened[0].effects, screened[0].u)]
     return fit(given, leading[0], usual=usual)
 
 
 def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Start]:
     """A start's cost after a linear step of all but its gridded parameters, and the start there."""
-    (key,) = start.effects
+    key = start.effects[-1]
     slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
     fixed = [
         slot.start + j

@@ -26,13 +26,13 @@ from simgap.attribution.posterior import forms
 from simgap.attribution.search import clear, doubtful, sought, statistic
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
-from simgap.gap.frame import as_from_wrist, of_wrist
+from simgap.gap.frame import as_from_wrist, of_wrist, thinned
 from simgap.gap.search import PROMISING, Identified, Search, search
 from simgap.progress import Progress, silent
 from simgap.source_digest import source_digest
 from simgap.world.operator import OperatorSettings, Plan
 from simgap.world.properties import Block, Blocks
-from simgap.world.replay import plan_again
+from simgap.world.replay import QUICKEST, plan_again
 from simgap.world.simulate import SimulatedTrial, noise_sd, record, simulate_plans, simulate_trials
 from simgap.world.virtual_model import Surroundings
 
@@ -223,12 +223,16 @@ def _recorded(found: Search, which: range, seed: int) -> list[list[Trial]]:
 
 
 def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -> list[Plan]:
-    """Commands for the recorded motions of every trial."""
-    noise = noise_sd(rig, "force")
-    return [
-        plan_again(task_space(trial, rig), task, blocks, [s.start for s in a.segmentation.spans[1:]], noise)
-        for trial, a in zip(found.trials, found.aligned.trials, strict=True)
-    ]
+    """Commands for the recorded motions of every trial, as quick as a hand commands."""
+    out = []
+    for trial, a in zip(found.trials, found.aligned.trials, strict=True):
+        small, group = thinned(trial, rig, 1 / QUICKEST)
+        signals = task_space(small, rig)
+        quieter = {n: getattr(signals, n) / np.sqrt(group) for n in ("sd_x", "sd_y", "sd_vx", "sd_vy")}
+        starts = [s.start for s in a.segmentation.spans[1:]]
+        noise = noise_sd(rig, "force") / np.sqrt(group)
+        out.append(plan_again(replace(signals, **quieter), task, blocks, starts, noise))
+    return out
 
 
 def blocks_of(found: Search) -> dict[str, Block]:

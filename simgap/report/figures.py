@@ -21,10 +21,14 @@ from simgap.robots.diagnose import RobotDiagnosis
 Body = Mapping[str, Any]
 
 
-def draw_all(body: Body, subtasks: Sequence[str], path: Callable[[str], Path]) -> None:
-    """All figures that the body tells of, at the paths that `path(name)` gives."""
+def draw_all(
+    found: Diagnosis | GenericDiagnosis, subtasks: Sequence[str], path: Callable[[str], Path]
+) -> None:
+    """All figures of a diagnosis, at the paths that `path(name)` gives."""
+    body = found.body
     draw_heat_map(body, subtasks, path("gap_where.png"))
     draw_suspects(body, path("gap_probabilities.png"))
+    draw_signal(found, path("gap_signal.png"))
     if body.get("shrinkage") and body["shrinkage"].get("before") is not None:
         draw_how_far(body, path("gap_before_after.png"))
 
@@ -199,18 +203,12 @@ def draw_robot(
     found: Robot, body: dict[str, Any], own: Mapping[str, Own], path: Callable[[str], Path]
 ) -> None:
     """All figures, at the paths that `path(name)` gives."""
-    if isinstance(found, RobotDiagnosis):
-        phases = sorted({cell["subtask"] for cell in body["where"]})
-        if phases:
-            draw_heat_map(body, phases, path("gap_where.png"))
-        draw_suspects(body, path("gap_probabilities.png"))
-    draw_robot_page(found, own, path)
-
-
-def draw_robot_page(found: Robot, own: Mapping[str, Own], path: Callable[[str], Path]) -> None:
-    """Those that a page shows next to its own tables."""
+    phases = sorted({cell["subtask"] for cell in body["where"]})
+    if phases:
+        draw_heat_map(body, phases, path("gap_where.png"))
     draw_course(max(courses(found, own), key=lambda c: c.over), found, path("gap_signal.png"))
     if isinstance(found, RobotDiagnosis):
+        draw_suspects(body, path("gap_probabilities.png"))
         draw_before_after(found, path("gap_before_after.png"))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from hmmseg.levels import CERTAIN
 from hmmseg.numbers import between, estimate, interval, percent, plain, shown_as
 from hmmseg.tables import listed
 
@@ -112,9 +113,8 @@ WHEN = {
     "still": "while it stands still",
 }
 SAID = 3  # look: places of a gap that a sentence has
-SLOW = 1.5  # chosen: Hz: below it a residual is an offset for the eye
+SLOW = 1.5  # look: Hz: below it a residual is an offset for the eye
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
-ALPHA = 0.05  # chosen: p-value below which what remains is more than noise
 TINY = 1e-16  # numerics: what double precision tells from zero next to one
 
 
@@ -288,7 +288,7 @@ def remains(body: Body) -> list[str]:
 def _noise(rest: Mapping[str, Any]) -> bool:
     """Whether what remains is no more than noise leaves."""
     p = rest.get("p_value")
-    return not rest.get("where") if p is None else p >= ALPHA
+    return not rest.get("where") if p is None else p >= 1 - CERTAIN
 
 
 def settles(body: Body, weighed: bool) -> str:

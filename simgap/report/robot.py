@@ -14,6 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from hmmseg.errors import InputError
+from hmmseg.levels import CERTAIN
 from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.robots.linear import base_at
@@ -22,7 +23,6 @@ from simgap.simulators.recording import Recording
 if TYPE_CHECKING:
     from simgap.simulators.mjcf.load import Loaded
 
-MOVED = 0.01  # chosen: of histories in which nothing moved, those of which a parameter is said to have
 NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
 
 
@@ -175,7 +175,7 @@ def compared(
     more than both intervals allow, Bonferroni over all of them; `within` where it lies in the interval of
     then; else `cannot tell`, as where logs tell nothing of it. What was never known before is left out."""
     out = {}
-    reach = norm.isf(MOVED / 2 / max(len(now), 1))
+    reach = norm.isf((1 - CERTAIN) / 2 / max(len(now), 1))
     for name, p in now.items():
         known = ((e["date"], e["parameters"].get(name)) for e in reversed(past))
         date, then = next(((d, q) for d, q in known if q and q["mean"] is not None), (None, None))

@@ -42,8 +42,7 @@ from simgap.world.virtual_model import Surroundings, physics, substeps_for
 # What the hand's sensors record of a true motion: samples at a rate, with the rig's noise.
 
 DEFAULT_RATE = 20.0  # cited: Hz, the paper's
-# chosen: standard deviations of one sample where a rig leaves them to be learned
-# prior: rad, m, rad/s, N
+# prior: standard deviations of one sample where a rig leaves them to be learned: rad, m, rad/s, N
 DEFAULT_NOISE = {"angle": 2e-4, "position": 3e-5, "velocity": 0.03, "force": 0.012}
 DEFAULT_CARTESIAN_VELOCITY = 0.004  # prior: m/s
 

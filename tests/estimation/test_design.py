@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimation.design import UNLIKE, _combined, build, simplest_combinations, unexpected_bias
+from estimation.design import UNLIKE, PadDoubt, _combined, build, simplest_combinations, unexpected_bias
 from estimation.observations import aligned_weights
 from estimation.posterior import find_mode, posterior
 from experiments.worlds import simulated_cases
@@ -169,13 +169,19 @@ def test_rigid_pads_that_give_are_told_and_allowed_for(case, aligned):
     found = align(case.trials, case.task, rig)
     weighed, noise = aligned_weights(found, np.random.default_rng(0))
     design = build(found, weighed, noise)
-    assert design.doubt.normal == pytest.approx(1.0, abs=0.2)  # in units of pads of 4000 N/m
+    assert design.doubts["normal"].share == pytest.approx(1.0, abs=0.2)  # in units of pads of 4000 N/m
     names = {n.name for n in design.nuisances if n.name.startswith("pad")}
     assert names >= {"pad_normal.1", "pad_normal.2", "pad_normal_exponent"}
     mode = find_mode(posterior(design))
     i = design.names.index(("block1", "width"))
     error = mode.unknowns[i] - case.blocks["block1"]["width"][0]
     assert abs(error) < 3 * np.sqrt(mode.unknowns_covariance[i, i]) < 2e-3
+
+
+def test_pads_that_may_be_wrong_have_the_variance_of_both_cases():
+    doubt = PadDoubt(share=-0.4, odds=0.25)
+    draws = np.where(np.random.default_rng(0).uniform(size=100_000) < 0.25, -0.4, 0.0)
+    assert doubt.extra_sd == pytest.approx(np.sqrt(np.mean(draws**2)), rel=0.01)
 
 
 def test_alignments_are_combined_by_rubins_rule():

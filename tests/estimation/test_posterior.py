@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from estimation_scene import TRUE, UNIT, drawn, make_design
+from estimation_scene import UNIT, drawn, make_design
 
 from estimation import priors
 from estimation.pads import SLOPE_SD
@@ -102,15 +102,6 @@ def test_a_channel_without_observations_keeps_its_prior():
     np.testing.assert_allclose(mean[:, -4], 0.0)  # the share of a channel that shows nothing
 
 
-def test_priors_are_in_the_order_of_the_names():
-    mean, sd = priors.property_priors([("b", "height"), ("a", "weight")])
-    np.testing.assert_allclose(
-        mean, np.log([priors.PROPERTY_MEDIAN["height"], priors.PROPERTY_MEDIAN["weight"]])
-    )
-    assert sd.tolist() == [priors.PROPERTY_LOG_SD["height"], priors.PROPERTY_LOG_SD["weight"]]
-    assert np.all(np.abs(np.log(TRUE[[2, 0]]) - mean) < sd)  # a common block is no surprise
-
-
 @pytest.mark.parametrize("terms", [(1,), (1, 1), (1, 2)])
 def test_prior_of_a_sum_against_drawn_sums(terms):
     """Fenton's log-normal has the moments of the sum; of one property it is its very prior."""
@@ -123,12 +114,6 @@ def test_prior_of_a_sum_against_drawn_sums(terms):
     assert density @ grid == pytest.approx(values.mean(), rel=0.02)
     assert density @ (grid < 0.05) == pytest.approx(np.mean(values < 0.05), abs=0.03)
     assert priors.log_prior("height", np.array(terms), np.array([-0.01]))[0] == -np.inf
-
-
-def test_prior_of_a_difference_is_symmetric():
-    values = np.array([-0.02, 0.02])
-    low, high = priors.log_prior("height", np.array([1, -1]), values)
-    assert low == pytest.approx(high)
 
 
 def with_slopes(design, seed=11):
@@ -215,7 +200,7 @@ def test_the_mode_is_stationary_and_its_covariance_the_inverse_curvature():
 def test_jax_and_numpy_agree_on_the_density():
     post = posterior(drawn(make_design(deviations=2), 7)[0])
     theta = 3 * np.random.default_rng(0).normal(size=(200, 6))
-    found = log_density(jnp.asarray(theta), jax.tree.map(jnp.asarray, post.tables), jnp)
+    found = log_density(jnp.asarray(theta), jax.tree.map(jnp.asarray, post.model), jnp)
     np.testing.assert_allclose(found, post.log_prob(theta), rtol=1e-10)
     assert 0 < np.isinf(found).sum() < 20  # beyond the farthest as well
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from estimation_scene import UNIT, drawn, make_design
 
-from estimation import priors, sampler
+from estimation import priors
 from estimation.posterior import find_mode, posterior
 from estimation.sampler import GROUPS, MIN_ESS, effective_sample_size, proposal, sample, split_rhat
 
@@ -104,14 +104,6 @@ def test_draws_that_only_the_prior_decides_do_not_pass_as_converged():
     assert never.converged and (never.flat[:, 1:] > 0).all()
 
 
-def test_systematic_resampling_keeps_the_weights():
-    weight = np.random.default_rng(0).dirichlet(np.ones(50))
-    big = np.concatenate([np.repeat(weight / 200, 200)])
-    index = sampler._resampled(big, np.random.RandomState(0))
-    np.testing.assert_allclose(np.bincount(index // 200, minlength=50) / big.size, weight, atol=1.1 / 10_000)
-    assert (np.diff(index) >= 0).all()
-
-
 def test_the_same_seed_draws_the_same(post, draws):
     again, other = sample(post, seed=1), sample(post, seed=2)
     np.testing.assert_array_equal(again.chain, draws.chain)
@@ -137,13 +129,6 @@ def test_effective_sample_size_of_a_chain_with_known_autocorrelation(rho):
     assert effective_sample_size(chain) == pytest.approx(
         expected, rel=0.15
     )  # the window of 5 tau loses 1 % or more
-
-
-def test_the_worst_parameter_counts():
-    rng = np.random.default_rng(1)
-    good, bad = ar1((20, 2000), 0.0, rng), ar1((20, 2000), 0.8, rng)
-    both = effective_sample_size(np.concatenate([good, bad], axis=2))
-    assert both == pytest.approx(effective_sample_size(bad))
 
 
 def test_rhat_against_its_definition_and_drift():

@@ -10,7 +10,6 @@ import pytest
 
 from hmmseg import cache
 from hmmseg.cache import CacheWarning, cache_folder, keep_numbers, kept_numbers
-from hmmseg.online.compiled import _is_index
 
 
 @pytest.fixture(autouse=True)
@@ -103,11 +102,30 @@ def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp
     assert run() == (True, "")
 
 
-def test_an_index_that_another_process_writes_again_is_no_damage(tmp_path):
-    index = tmp_path / "f.nbi"
-    whole = pickle.dumps("0.61") + pickle.dumps(("stamp", {"signature": "f.1.nbc"}))
-    index.write_bytes(whole)
-    assert _is_index(index)
-    for damaged in (b"", whole[:-1], whole[: len(whole) // 2], whole + b"x", bytes(b ^ 255 for b in whole)):
-        index.write_bytes(damaged)
-        assert not _is_index(index)
+FUNCTION = """
+from hmmseg.online.compiled import compiled
+@compiled
+def double(x):
+    return 2 * x
+print(double(1.5), sum(double.stats.cache_hits.values()))
+"""
+
+
+def test_functions_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
+    program, environment = tmp_path / "program.py", {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    program.write_text(FUNCTION)
+    environment.pop("NUMBA_CACHE_DIR", None)
+
+    def run():
+        done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True)
+        return done.stdout.strip(), "not as it was written" in done.stderr
+
+    assert run() == ("3.0 0", False)
+    assert run() == ("3.0 1", False)
+    for kind in "nbi", "nbc":
+        (file,) = (tmp_path / "hmmseg/numba").rglob(f"*.{kind}")
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        file.write_bytes(content)
+        assert run() == ("3.0 0", True)
+        assert run() == ("3.0 1", False)

@@ -23,7 +23,7 @@ from hmmseg.online import hypothesis as one
 from hmmseg.online.hypotheses import Table, absorb
 from hmmseg.online.hypothesis import HYPOTHESIS, RANGES, READING
 from hmmseg.online.watcher import Watcher
-from hmmseg.online.wrist import Closings
+from hmmseg.online.wrist import Opening
 from hmmseg.segmentation.align import align, segment
 from hmmseg.segmentation.emissions import STILL, Parameters, _log_halting, features, log_likelihoods
 from hmmseg_cli.main import main
@@ -342,9 +342,9 @@ def test_an_opening_is_read_as_it_comes():
     way = 0.05 - 0.1 * np.clip(t - 0.5, 0, None)
     held = 0.029 + 0.001 * np.exp(-(t - 0.7) / 0.03)
     opening = np.where(way > 0.03, way, held) + np.where(t > 2, 0.1 * (t - 2), 0)
-    closings, known = Closings(lambda t, opening: None), []
+    closings, known = Opening(3000.0), []
     for at, value in zip(t, opening, strict=True):
-        closings.take(float(at), float(value))
+        closings.follow(float(at), float(value))
         known.append(closings.known)
     assert closings.number == 1
     grip = closings.grips[-1]

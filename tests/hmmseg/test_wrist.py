@@ -8,9 +8,9 @@ import pytest
 from estimation.identification import identify_aligned
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
+from hmmseg.hand.grips import closings, grip_of
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.tool import applied_force, free_tool, pose_of
-from hmmseg.hand.wrist import closings, grip_of
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.table import frame_table
 from hmmseg.io.task import read_task
@@ -74,7 +74,7 @@ def test_a_recording_may_end_as_it_grips(after):
     t = np.arange(50) / 50
     opening = np.maximum(0.05 - 0.04 * np.maximum(t - 0.5, 0), 0.05 - 0.04 * (t[-after] - 0.5))
     (closing,) = closings(opening)
-    grip = grip_of(t, opening, np.zeros(50, bool), closing, None)
+    grip = grip_of(t, opening, closing, None, 3000.0)
     assert grip is None or opening[-1] <= grip.width <= 0.05
 
 

@@ -7,7 +7,6 @@ import pytest
 from matplotlib.image import imread
 from matplotlib.text import Text
 
-from estimation import plots
 from estimation.plots import Prediction, draw_corner, draw_estimates, draw_predictive
 from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.signals import Signals
@@ -107,24 +106,6 @@ def test_estimates_with_null_and_bounded_properties(tmp_path, texts, actual):
     check_picture(tmp_path / "estimates.png")
     assert {" not determined ", " lower bound only ", "≥ 0.50", "block1 weight"} <= set(texts)
     assert ("0.350 ± 0.010 N" if actual is None else "0.350 ± 0.010 N  (0.3430)") in texts
-
-
-def test_row_lies_at_the_relative_residual(tmp_path, monkeypatch):
-    drawn = {}
-    draw_row = plots._draw_row
-
-    def record(ax, y, key, *rest):
-        reach = draw_row(ax, y, key, *rest)
-        drawn[key] = [line.get_xdata() for line in ax.lines]
-        return reach
-
-    monkeypatch.setattr(plots, "_draw_row", record)
-    draw_estimates({"block1": {"weight": PROPERTIES["block1"]["weight"]}}, {"block1": {"weight": (0.4, 0.0)}},
-                   tmp_path / "row.png")  # fmt: skip
-    wide, narrow, centre = drawn["weight"]
-    np.testing.assert_allclose(wide, [-17.5, -7.5])
-    np.testing.assert_allclose(narrow, [-15.0, -10.0])
-    np.testing.assert_allclose(centre, -12.5)
 
 
 def test_predictive_band_and_its_coverage(tmp_path, texts):

@@ -84,12 +84,12 @@ def test_a_motion_is_written_as_its_log_has_it():
 
 def test_a_page_says_a_value_in_its_columns_unit_and_a_loads_place():
     bias = {"mean": np.pi / 180, "sd": 1e-4, "interval_90": [0.017, 0.018], "unit": "rad", "nominal": 0.0}
-    setting = Setting([], [], own={"q1": DEGREES})
+    setting = Setting([], own={"q1": DEGREES})
     ((_, model, found, ends),) = _parameters({"parameters": {"bias": bias}}, ["readout:q1.bias"], setting)
     assert (model, found) == ("0 deg (0 mrad)", "1.0000 ± 0.0057 deg (17.45 ± 0.10 mrad)")
     assert ends == "0.974 to 1.031 deg (17.00 to 18.00 mrad)"
     load = {"mean": 0.09, "sd": 0.001, "interval_90": [0.088, 0.092], "unit": "kg", "nominal": 0.0}
-    setting = Setting([], [], shows={"body:arm.payload": "a load on arm, at 300, 0, 0 mm in its frame"})
+    setting = Setting([], shows={"body:arm.payload": "a load on arm, at 300, 0, 0 mm in its frame"})
     ((words, *_),) = _parameters({"parameters": {"payload": load}}, ["body:arm.payload"], setting)
     assert words == "arm: a load at 300, 0, 0 mm in its frame"
 

@@ -5,19 +5,17 @@ import numpy as np
 import pytest
 from simgap_scenes import HAND, STACK
 
-from experiments.benchmarks.haptic_loop import squeeze
+from experiments.benchmarks.haptic_loop import PassivityControl, squeeze, stiffest_passive
 from hmmseg.contact.decompose import subtasks
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.replay import replay, residual_summary, smooth
 from simgap.world.simulate import simulate_trial
 from simgap.world.virtual_model import (
     RIGID_PAD,
-    PassivityControl,
     VirtualModel,
     physics,
     rollout,
     standing,
-    stiffest_passive,
     substeps_for,
 )
 

@@ -1,0 +1,166 @@
+"""When a gripper closes on something, and the opening at which its pads touch it.
+
+An opening goes up and down between turning points. A closing that ends in a stand grips, with the opening
+held there; pads and drive give in a grip, so that the touch is further open. What the pads press with and
+their stiffness tell by how much. Else the way itself does: a closing gripper has not touched yet while it is
+at its fastest, and an opening one leaves its stand where the pads let go. `Closings` takes samples one by
+one, of a whole recording as of one that is still being made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hmmseg.hand.signals import grouped
+from hmmseg.levels import SURE
+from hmmseg.robust import median_of_known, white_sd
+
+STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
+SOFT = 0.1  # prior: of what gives in a grip: its touch is known no better, as pads are no ideal springs
+GIVE = (1e-3, 1.5e-3)  # prior: m, mean and sd: what pads and drive give in a grip, before anything is seen
+REST = 0.1  # chosen: share of an opening's way, or of its top speed, that is next to none: the gripper stands
+LEAST_CLOSING = 1e-3  # limit: m; a smaller swing of the opening is no grip
+
+
+@dataclass(frozen=True)
+class Grip:
+    """One closing on something: samples [start, stop) in which the pads touch it.
+
+    `held` [m]: the opening at which it stands; `width` [m] and `width_sd`: the opening at which both
+    pads just touch.
+    """
+
+    start: int
+    stop: int
+    held: float
+    width: float
+    width_sd: float
+
+
+class Closings:
+    """Closings of an opening by its turning points, from swings that count.
+
+    `swing` [m]: the least that counts; `closing`: whether the opening has not turned up since it closed;
+    `extreme`: where it was widest since it turned up, or closest since it turned down.
+    """
+
+    def __init__(self, swing: float) -> None:
+        self.swing, self.closing, self.extreme = swing, False, (0.0, -np.inf)
+
+    def take(self, at: float, opening: float) -> bool:
+        """The opening [m] at a next time or sample; whether it has turned."""
+        extreme = self.extreme[1]
+        away = extreme - opening if not self.closing else opening - extreme
+        if away <= 0:
+            self.extreme = at, opening
+        if away <= self.swing:
+            return False
+        self.closing, self.extreme = not self.closing, (at, opening)
+        return True
+
+
+Closing = tuple[
+    int, int, int | None
+]  # samples: where it begins and is least, and where it is open again, if so
+
+
+def closings(opening: np.ndarray) -> list[Closing]:
+    """Closings of a whole opening (num_timesteps,) [m].
+
+    A swing counts where it is a tenth of the whole way and beyond the noise.
+    """
+    each = Closings(least_swing(float(np.ptp(opening)), white_sd(opening)))
+    turning = []
+    for i, value in enumerate(opening.tolist()):
+        before = int(each.extreme[0])
+        turning += [before] * each.take(i, value)
+    turning.append(int(each.extreme[0]))
+    ends = [*turning[2::2], None]
+    return list(zip(turning[::2], turning[1::2], ends, strict=False))
+
+
+def free_samples(opening: np.ndarray, found: list[Closing]) -> np.ndarray:
+    """Samples (num_timesteps,) that are surely no grip's: more open than halfway back."""
+    free = np.ones(opening.size, bool)
+    for begun, least, opened in found:
+        inside, top = slice(begun, None if opened is None else opened + 1), _ceiling(opening, begun, opened)
+        free[inside] &= opening[inside] >= (opening[least] + top) / 2
+    return free
+
+
+def _ceiling(opening: np.ndarray, begun: int, opened: int | None) -> float:
+    """How far open it is both before and after a closing [m]."""
+    return float(min(opening[begun], np.inf if opened is None else opening[opened]))
+
+
+def least_swing(way: float, noise: float) -> float:
+    """The least swing that counts [m] of an opening that goes so far, with this noise sd [m]."""
+    return max(REST * way, 2 * SURE * noise, LEAST_CLOSING)
+
+
+def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
+            pressing: np.ndarray | float | None, stiffness: float) -> Grip | None:  # fmt: skip
+    """The grip that a closing ends in; None where the opening never stands.
+
+    `pressing` (num_timesteps,) [N]: what each pad presses with, None where it is unknown; `stiffness` [N/m]
+    of one pad.
+    """
+    begun, least, opened = closing
+    floor, end = float(opening[least]), t.size - 1 if opened is None else opened
+    inside = np.arange(begun, end + 1)
+    low = inside[opening[inside] <= floor + REST * (_ceiling(opening, begun, opened) - floor)]
+    held, first, last = float(np.median(opening[low])), int(low[0]), int(low[-1])
+    force = np.nan if pressing is None else median_of_known(np.broadcast_to(pressing, t.shape)[low])
+    if np.isfinite(force):
+        width, sd = held + 2 * force / stiffness, 0.0
+    else:
+        widest = _fastest(t, opening, begun, first, held)
+        seen = _release(t, opening[: end + 1], last, held)
+        if seen is None or not held < seen[0] <= widest:  # it opens in steps, or not yet
+            seen = (widest + held) / 2, max((widest - held) / np.sqrt(12), _noise(opening))
+        width, sd = _with_prior(seen, held)
+    start = int(inside[np.argmax(opening[inside] <= width)])
+    after = np.flatnonzero(opening[last : end + 1] > width)
+    stop = int(last + after[0]) if after.size else end + 1
+    return Grip(start, stop, held, width, sd) if stop - start > 2 else None
+
+
+def _fastest(t: np.ndarray, opening: np.ndarray, begun: int, first: int, held: float) -> float:
+    """Opening [m] at which a closing is fastest: what is touched later is narrower."""
+    way = _coarse(t, opening, begun, first + 1)
+    return max(float(way[np.argmin(np.diff(way))] if way.size > 1 else opening[begun]), held)
+
+
+def _release(t: np.ndarray, opening: np.ndarray, last: int, held: float) -> tuple[float, float] | None:
+    """Opening [m] at which fingers that stand at `last` take off, and its sd; None where noise hides it."""
+    lead = max(3, int(3 * STEP / np.median(np.diff(t))))
+    way, noise = _coarse(t, opening, max(last - lead, 0), opening.size), _noise(opening)
+    wide = np.flatnonzero(way > (held + opening[-1]) / 2)
+    way = way[: wide[0] + 2] if wide.size and opening.size > last + 1 else way
+    if way.size < 4:
+        return None
+    third = np.diff(way, 3)
+    at = int(np.argmax(third))
+    if third[at] < SURE * np.sqrt(20) * noise:
+        return None
+    return float(way[at + 2]), max(float(way[at + 3] - way[at + 1]) / 4, noise)
+
+
+def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.ndarray:
+    """The opening [m] every STEP, means of what lies within, of samples [start, stop)."""
+    group = max(1, int(STEP / float(np.median(np.diff(t))) + 1e-6))
+    return grouped(opening[start:stop], group)[0]
+
+
+def _noise(opening: np.ndarray) -> float:
+    """Noise sd [m] of one sample of the opening."""
+    return max(white_sd(opening), 1e-6)
+
+
+def _with_prior(seen: tuple[float, float], held: float) -> tuple[float, float]:
+    """Mean and sd [m] of the opening at the touch, from what was seen of it and what pads give."""
+    precision = np.array([seen[1], GIVE[1]]) ** -2.0
+    mean = max(float(precision @ [seen[0], held + GIVE[0]] / precision.sum()), held)
+    return mean, max(float(precision.sum() ** -0.5), SOFT * (mean - held))
