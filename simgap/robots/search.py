@@ -150,9 +150,7 @@ class Search:
         there promise more: commands in steps are nearly those in lines that come later, and no small step
         leads from one to the other."""
         effects = self.composed.effects
-        for name in (
-            n for n in self.along if self.composed.effects[n].numeric and not self.composed.effects[n].dear
-        ):
+        for name in (n for n in self.along if effects[n].numeric and not effects[n].dear):
             for short, known in effects[name].parameters.items():
                 if np.isfinite([known.low, known.high]).all():
                     near_low = best.point[name][short] < 0.5 * (known.low + known.high)
