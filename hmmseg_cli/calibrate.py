@@ -38,7 +38,7 @@ def calibrate(
         document = found.body()
         out.print(*tables(document), *(f"{name}: {reason}" for name, reason in document["reasons"].items()))
         if patch is not None:
-            changed = [n for n in found.point if not found.composed.numeric(n)]
+            changed = [n for n in found.point if not found.composed.effects[n].numeric]
             given = found.composed, found.point, document, changed, model
             write_patch(*given, lambda name: out.stage(patch / name))
         out.finish(document)

@@ -176,7 +176,7 @@ def diagnose_robot(
         given = found.composed, found.linear.point, document, document["causes"]
         if document["verdict"] == "unknown" and found.calibrated is not None:  # the best model there is
             whole, point = found.calibrated.composed, found.calibrated.point
-            moved = [n for n in point if not whole.numeric(n)]
+            moved = [n for n in point if not whole.effects[n].numeric]
             given = whole, point, document["calibrated"], moved
         _patch(out, own, *given)
     out.finish(document)
@@ -197,7 +197,7 @@ def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], o
     out.print(sentence(document), *usual_tables(document))
     _deliver(out, own, found, document, loaded, logs[: len(paths)], effects)
     if own.patch is not None:
-        point = {n: v for n, v in found.point().items() if not found.composed.numeric(n)}
+        point = {n: v for n, v in found.point().items() if not found.composed.effects[n].numeric}
         _patch(out, own, found.composed, point, document, document["causes"])
     out.finish(document)
 

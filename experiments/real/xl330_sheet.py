@@ -64,7 +64,8 @@ def draw(loaded: Loaded, logs: list[Recording], left_out: Recording, path: Path)
         axes = figure.add_subplot()
         axes.plot(left_out.t, np.rad2deg(left_out["position"]), color=INK, lw=1.6, label="recorded")
         for label, (colour, point) in curves.items():
-            for window, run in zip(whole.windows, whole.read(whole.run(point), point), strict=True):
+            read = whole.read(whole.rolled(point, whole.starts(point)), point)
+            for window, run in zip(whole.windows, read, strict=True):
                 if run is not None:
                     times = left_out.t[window.begin : window.end]
                     axes.plot(times, np.rad2deg(run["position"]), color=colour, label=label)

@@ -27,7 +27,8 @@ def of_the_model(setting: Setting) -> list[RobotEffect]:
     """One for each effect that the simulator's parameters name; a parameter without one is its own. The
     solver's own numbers are fitted along: no robot has a step."""
     groups: dict[str, dict[str, str]] = {}
-    known, numerics = setting.simulator.parameters, getattr(setting.simulator, "numerics", ())
+    known, numerics = setting.simulator.parameters, {*getattr(setting.simulator, "numerics", ())}
+    dear = {*getattr(setting.simulator, "dear", numerics)}
     for name, parameter in known.items():
         effect = parameter.effect or name
         if any(known[n].fitted != parameter.fitted for n in groups.get(effect, {}).values()):
@@ -45,6 +46,8 @@ def of_the_model(setting: Setting) -> list[RobotEffect]:
             {short: known[name] for short, name in names.items()},
             model=names,
             fitted=all(known[n].fitted or n in numerics for n in names.values()),
+            numeric=bool(numerics & {*names.values()}),
+            dear=bool(dear & {*names.values()}),
         )
         for effect, names in groups.items()
     ]

@@ -1,6 +1,6 @@
 """What an effect on a robot is: composed around a simulator, never inside of it.
 
-An effect acts on what is read (`read`), on what is commanded (`command`), or on parameters that the
+An effect acts on what is read (`alter`), on what is commanded (`command`), or on parameters that the
 simulator itself offers (`model`).
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from simgap.channels import Act, ChannelEffect, Theta
+from simgap.channels import ChannelEffect, Theta
 from simgap.effect import Effect, Parameter
 from simgap.simulators.protocol import Channels, Simulator
 from simgap.simulators.recording import Recording
@@ -25,19 +25,17 @@ Alter = Callable[[Recording, Channels, Theta], Channels]  # (window, channels as
 
 @dataclass(frozen=True)
 class RobotEffect(Effect):
-    """One candidate. `parameters` by short name, neutral at their nominal; it reads, commands or models.
+    """One candidate. `parameters` by short name, neutral at their nominal; it alters, commands or models.
 
-    `read` maps values (num_timesteps,) of `channel` as they are to as they are read, `undo` back again.
-    `alter` gives several channels or such as depend on others, `restore` undoes it on a whole log. `command`
-    maps a whole recording to one whose commands are as the drives took them. `model` maps short names to the
-    simulator's parameters. What is `fitted` is fitted along with every cause and is none itself; `widened`:
-    how many usual sizes its parameters' sd are, where that is of what a model states and nobody measured;
-    `by_log`: each log has its own parameters, which no other log tells.
+    `alter` gives those channels of a window that are not read as they are, `restore` undoes it on a whole
+    log, from which starts are read then. `command` maps a whole recording to one whose commands are as the
+    drives took them. `model` maps short names to the simulator's parameters. What is `fitted` is fitted along
+    with every cause and is none itself; `widened`: how many usual sizes its parameters' sd are, where that is
+    of what a model states and nobody measured; `by_log`: each log has its own parameters, which no other log
+    tells; `numeric`: it is of the simulator's own numerics (its step, how it holds commands), `dear` where
+    that costs another run of every window.
     """
 
-    channel: str = ""
-    read: Act | None = None
-    undo: Act | None = None
     alter: Alter | None = None
     restore: Command | None = None
     command: Command | None = None
@@ -45,20 +43,12 @@ class RobotEffect(Effect):
     fitted: bool = False
     widened: float = 0.0
     by_log: bool = False
+    numeric: bool = False
+    dear: bool = False
 
     def label(self, short: str) -> str:
         """A parameter's name: the effect's, and its own where that has several."""
         return self.name if len(self.parameters) == 1 else f"{self.name}.{short}"
-
-    @property
-    def undoes(self) -> bool:
-        """Whether starts are read through it, so that it is undone before they are."""
-        return self.undo is not None or self.restore is not None
-
-    @property
-    def reads(self) -> bool:
-        """Whether it acts on read-outs alone and needs no rollout."""
-        return self.read is not None or self.alter is not None
 
 
 def entry(parameter: Parameter, mean: float, sd: float) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from simgap.channels import ChannelEffect, Theta, channel_effects
+from simgap.channels import Act, ChannelEffect, Theta, channel_effects
 from simgap.channels.sensors import LAG
 from simgap.effect import Parameter
 from simgap.robot_effects.base import Alter, RobotEffect, Setting
@@ -64,9 +64,20 @@ def candidates(setting: Setting) -> Iterator[RobotEffect]:
 
 def of_channel(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffect:
     """An effect on what is read of one channel."""
-    parameters = setting.sized(effect, name)
-    return RobotEffect(f"readout:{name}.{effect.name}", effect.says, parameters, effect.shows,
-                       channel=name, read=effect.read, undo=effect.undo)  # fmt: skip
+    begun = {r.name: float(r.t[0]) for r in setting.recordings}
+
+    def acting(act: Act, log: Recording, values: np.ndarray, theta: Theta) -> dict[str, np.ndarray]:
+        return {name: act(log.t - begun.get(log.name, log.t[0]), values, theta)}
+
+    def restore(log: Recording, theta: Theta) -> Recording:
+        assert effect.undo is not None
+        return log.with_columns(acting(effect.undo, log, log[name], theta))
+
+    return RobotEffect(
+        f"readout:{name}.{effect.name}", effect.says, setting.sized(effect, name), effect.shows,
+        alter=lambda window, channels, theta: acting(effect.read, window, channels[name], theta),
+        restore=None if effect.undo is None else restore,
+    )  # fmt: skip
 
 
 Turn = Callable[[np.ndarray, Channels, Theta, float], Channels]  # (times, columns, theta, 1 there or -1 back)

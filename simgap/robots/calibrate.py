@@ -22,7 +22,7 @@ from simgap.robot_effects import LACKING
 from simgap.robot_effects.base import NORMAL_90, RobotEffect, entry
 from simgap.robots.fit import FINEST, Whiten, moved_to
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
-from simgap.robots.model import Composed, Point, is_numeric
+from simgap.robots.model import Composed, Point
 from simgap.robots.rows import folds_of, noises
 from simgap.robots.whiten import covariances
 from simgap.robots.windows import LENGTH
@@ -70,7 +70,7 @@ class Calibration:
     def body(self) -> dict[str, Any]:
         """The document: parameters, what is told only together, the simulation's numbers, held-out logs."""
         every = range(len(self.names))
-        own = [k for k in every if not self.composed.numeric(self.names[k][0])]
+        own = [k for k in every if not self.composed.effects[self.names[k][0]].numeric]
         untold = [k for k in own if not self.told[k]]
         return {
             "parameters": {self.label(k): self.entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
@@ -181,7 +181,7 @@ def calibrate(
     """
     mine = {n: e for n, e in effects.items() if e.fitted or n in (begin or {})}
     fitted = [n for n, e in mine.items() if e.fitted]
-    if all(is_numeric(simulator, mine[n]) for n in fitted):
+    if all(mine[n].numeric for n in fitted):
         raise InputError("calibrate", "nothing of the model is uncertain", "uncertain = [..] in the map")
     noise = noises(simulator, recordings)
     point: Point = {n: (begin or {}).get(n, e.neutral()) for n, e in mine.items()}
@@ -335,12 +335,4 @@ def _held_out(
         point, _, _ = _least_squares(seen, found, AGAIN, free)
         part = composed.along(np.unique(rows.log[mine]).tolist())
         after[mine] = rows.observed[mine] - base_at(part, point).rows
-    return _rms(composed, before), _rms(composed, after)
-
-
-def _rms(composed: Composed, left: np.ndarray) -> dict[str, float]:
-    out = {}
-    for c, name in enumerate(composed.rows.channels):
-        mine = left[composed.rows.channel == c]
-        out[name] = float(np.sqrt(np.mean(mine**2))) if np.isfinite(mine).all() else np.nan
-    return out
+    return rows.rms(before), rows.rms(after)

@@ -47,7 +47,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
 from simgap.robots.fit import Local, descended
 from simgap.robots.linear import base_at
-from simgap.robots.model import Composed, Point, is_numeric
+from simgap.robots.model import Composed, Point
 from simgap.robots.rows import noises
 from simgap.robots.unchanged import (
     FAR,
@@ -489,7 +489,7 @@ def changes(
         calibration = calibrate(simulator, old, effects)
     noise = noises(simulator, old)
     point: Point = {} if calibration is None else calibration.point
-    candidates = [n for n, e in effects.items() if not is_numeric(simulator, e)]
+    candidates = [n for n, e in effects.items() if not e.numeric]
 
     def along(logs: Sequence[Recording]) -> Composed:
         made = Composed.of(simulator, logs, effects, noise, LONGEST)

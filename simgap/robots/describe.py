@@ -109,7 +109,7 @@ def _fitted(found: RobotDiagnosis, numeric: bool) -> dict[str, Any]:
     apart."""
     out = {}
     for name, before in found.plain.point.items():
-        if found.composed.numeric(name) is not numeric:
+        if found.composed.effects[name].numeric is not numeric:
             continue
         effect = found.composed.effects[name]
         for short, value in before.items():
@@ -146,12 +146,8 @@ def _by_phase(found: RobotDiagnosis, units: dict[str, str]) -> dict[str, Any]:
             continue
         before, after = far.squares[:, mine].sum(1)
         gap = before - mine.sum()
-        left = {}
-        for c, channel in enumerate(rows.channels):
-            here = mine & (rows.channel == c)
-            if here.any():
-                was, now = (float(np.sqrt(np.mean(r[here] ** 2))) for r in (far.plain, far.residual))
-                left[channel] = {"before": was, "after": now, "unit": units[channel]}
+        was, now = rows.rms(far.plain, mine), rows.rms(far.residual, mine)
+        left = {n: {"before": was[n], "after": now[n], "unit": units[n]} for n in was}
         stands_out = gap > SEEN * np.sqrt(2 * mine.sum())
         out[name] = {"fraction": float((before - after) / gap) if stands_out else None, "rms": left}
     return out

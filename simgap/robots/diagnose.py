@@ -17,7 +17,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
 from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.linear import Linear
-from simgap.robots.model import Composed, Point, is_numeric
+from simgap.robots.model import Composed, Point
 from simgap.robots.phases import Phases, phases_of
 from simgap.robots.rows import folds_of, noises
 from simgap.robots.search import Search, Settled
@@ -101,7 +101,7 @@ def diagnose(
     def calibrated(patterns: Sequence[str], begin: Point | None = None) -> Calibration | None:
         """With what models state or lack and nobody measured fitted; None where there is nothing of it."""
         wide = doubted(effects, patterns, getattr(simulator, "sd", {}))
-        if not any(e.fitted and not is_numeric(simulator, e) for e in wide.values()):
+        if not any(e.fitted and not e.numeric for e in wide.values()):
             return None
         return calibrate(simulator, recordings, wide, length=length, begin=begin, judged=False)
 

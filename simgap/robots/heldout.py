@@ -59,14 +59,8 @@ def shrinkage(best: Settled, nothing: Settled, composed: Composed, fold: np.ndar
     gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]
     if there.sum() <= 0:
         return None
-    rms = {}
-    for c, name in enumerate(rows.channels):
-        mine = usable & (rows.channel == c)
-        if mine.any():
-            rms[name] = (
-                float(np.sqrt(np.mean(before[mine] ** 2))),
-                float(np.sqrt(np.mean(after[mine] ** 2))),
-            )
+    was, now = rows.rms(before, usable), rows.rms(after, usable)
+    rms = {name: (was[name], now[name]) for name in was}
     mean = square.sum(0) / usable.sum()
     fraction, interval = fraction_gone(gone, there)
     return Shrinkage(float(mean[0]), float(mean[1]), float(mean[2]), fraction, interval, rms, before, after,

@@ -192,8 +192,8 @@ def _rows_at(
     it too, move by their sensitivities."""
     effect = composed.effects[name]
     moved = {**base.point, name: dict(values)}
-    if not effect.reads:
-        if composed.numeric(name):
+    if effect.alter is None:
+        if composed.effects[name].numeric:
             run, now = list(base.true), {**effect.neutral(), **base.point.get(name, {})}
             for short, value in values.items():
                 run = composed.stepped(run, name, short, value - now[short])
@@ -201,7 +201,7 @@ def _rows_at(
             run = composed.rolled(moved, base.begun)
         return composed.rows.averaged(composed.read(run, moved))
     out = composed.rows.averaged(composed.read(base.true, moved))
-    if effect.undoes:
+    if effect.restore is not None:
         for old, new, mine in zip(base.begun, composed.starts(moved), composed.rows.of, strict=True):
             if old is not None and new is not None:
                 for state, change in starts.items():

@@ -112,10 +112,6 @@ class Composed:
                     out[self.effects[name].model[short]] = value
         return out
 
-    def numeric(self, effect: str) -> bool:
-        """Whether an effect is of the simulator's own numerics."""
-        return is_numeric(self.simulator, self.effects[effect])
-
     def moved(self, point: Point) -> Composed:
         """The same, with what the simulator's own numbers do as it is at this point."""
         return replace(self, about=dict(point), _slopes={})
@@ -124,19 +120,14 @@ class Composed:
         """True channels of every window from these starts; None where a rollout diverged."""
         out = self._rolled(self._without_dear(point), self.windows, starts)
         for name, theta in point.items():
-            if self.dear(name):
+            if self.effects[name].dear:
                 neutral = self.effects[name].neutral()
                 for short, value in theta.items():
                     out = self.stepped(out, name, short, value - neutral[short])
         return out
 
-    def dear(self, effect: str) -> bool:
-        """Whether an effect of the simulator's own numerics costs another run of every window."""
-        dear = getattr(self.simulator, "dear", getattr(self.simulator, "numerics", ()))
-        return any(p in dear for p in self.effects[effect].model.values())
-
     def _without_dear(self, point: Point) -> Point:
-        return {n: v for n, v in point.items() if not self.dear(n)}
+        return {n: v for n, v in point.items() if not self.effects[n].dear}
 
     def stepped(
         self, true: Sequence[Channels | None], name: str, short: str, by: float
@@ -182,14 +173,16 @@ class Composed:
 
     def read(self, true: Sequence[Channels | None], point: Point) -> list[Channels | None]:
         """Channels of every window as they are read."""
-        acting = [(e, v) for e, v in self._acting(point) if e.reads]
+        acting = [(e.alter, v) for e, v in self._acting(point) if e.alter is not None]
         out: list[Channels | None] = []
         for window, channels in zip(self.windows, true, strict=True):
             if channels is None or not acting:
                 out.append(channels)
                 continue
-            log = self.recordings[window.log]
-            out.append(_read(acting, log.window(window.begin, window.end), float(log.t[0]), channels))
+            here, along = dict(channels), self.recordings[window.log].window(window.begin, window.end)
+            for alter, theta in acting:
+                here |= alter(along, here, theta)
+            out.append(here)
         return out
 
     def starts(self, point: Point) -> list[Mapping[str, float] | None]:
@@ -214,26 +207,16 @@ class Composed:
 
     def unread(self, point: Point) -> list[Recording] | None:
         """The recordings with read-outs' effects undone, None where none acts."""
-        acting = [(e, v) for e, v in self._acting(point) if e.undoes]
+        acting = [(e.restore, v) for e, v in self._acting(point) if e.restore is not None]
         if not acting:
             return None
         out = list(self.recordings)
-        for effect, theta in reversed(acting):
-            for i, log in enumerate(out):
-                if effect.restore is not None:
-                    out[i] = effect.restore(log, theta)
-                if effect.undo is not None:
-                    values = effect.undo(log.t - log.t[0], log[effect.channel], theta)
-                    out[i] = log.with_columns({effect.channel: values})
+        for restore, theta in reversed(acting):
+            out = [restore(log, theta) for log in out]
         return out
 
     def _acting(self, point: Point) -> list[tuple[RobotEffect, dict[str, float]]]:
         return [(self.effects[n], {**self.effects[n].neutral(), **v}) for n, v in point.items()]
-
-
-def is_numeric(simulator: Simulator, effect: RobotEffect) -> bool:
-    """Whether an effect is of the simulator's own numerics: its step, how it holds commands."""
-    return any(p in getattr(simulator, "numerics", ()) for p in effect.model.values())
 
 
 def _sum(one: Channels | None, other: Channels, by: float) -> Channels | None:
@@ -249,17 +232,6 @@ def settled(window: Recording) -> tuple[Recording, int]:
     t = np.concatenate([window.t[0] - step * np.arange(lead, 0, -1), window.t])
     columns = {n: np.concatenate([np.full(lead, v[0]), v]) for n, v in window.columns.items()}
     return Recording(window.name, t, columns, window.first), lead
-
-
-def _read(acting: Sequence, stretch: Recording, begin: float, true: Channels) -> Channels:
-    """A stretch of a log that begins at `begin` [s], through read-outs' effects one after another."""
-    here, since = dict(true), stretch.t - begin
-    for effect, theta in acting:
-        if effect.read is not None:
-            here[effect.channel] = effect.read(since, here[effect.channel], theta)
-        if effect.alter is not None:
-            here |= effect.alter(stretch, here, theta)
-    return here
 
 
 # A model's error is the same each time the same motion is made: twelve repeats tell of it what one does, and

@@ -45,6 +45,15 @@ class Rows:
                 out[mine] = pick.mean(np.array([channels[name] for name in self.channels]))
         return out
 
+    def rms(self, left: np.ndarray, among: np.ndarray | None = None) -> dict[str, float]:
+        """Root mean square by channel of values (N,), `among` some rows (N,) where a channel has any."""
+        out = {}
+        for c, name in enumerate(self.channels):
+            mine = (self.channel == c) & (True if among is None else among)
+            if mine.any():
+                out[name] = float(np.sqrt(np.mean(left[mine] ** 2)))
+        return out
+
 
 @dataclass(frozen=True)
 class _Pick:

@@ -30,7 +30,6 @@ from simgap.robots.sets import (
     Sets,
     cancelling,
     identifiability,
-    log_odds,
     neighbours,
     pairs,
     point_of,
@@ -40,6 +39,7 @@ from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener
 from simgap.robots.windows import STRIKES
 from simgap.simulators.protocol import Parameter
 
+EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are judged by
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, what tells how far straight lines are off of what takes a cause's place
@@ -118,7 +118,8 @@ class Search:
     @property
     def log_odds(self) -> float:
         """Prior log odds of one candidate to act."""
-        return log_odds(len(self.wanted))
+        share = min(EXPECTED / max(len(self.wanted), 1), 0.5)
+        return float(np.log(share / (1 - share)))
 
     def run(self, tell: Progress) -> Settled:
         """The best set: from nothing on, and where that leaves more than calibration does, from there
@@ -149,7 +150,7 @@ class Search:
         there promise more: commands in steps are nearly those in lines that come later, and no small step
         leads from one to the other."""
         effects = self.composed.effects
-        for name in (n for n in self.along if self.composed.numeric(n) and not self.composed.dear(n)):
+        for name in (n for n in self.along if effects[n].numeric and not effects[n].dear):
             for short, known in effects[name].parameters.items():
                 if np.isfinite([known.low, known.high]).all():
                     near_low = best.point[name][short] < 0.5 * (known.low + known.high)
@@ -157,9 +158,8 @@ class Search:
                     point = {**best.point, name: other}
                     there = replace(best, composed=best.composed.moved(point), point=point)
                     sets, levels = self.place(there, best.names)
-                    score, k = max((float(sets.scores([best.names], k)[0]), k) for k in range(len(levels)))
+                    score, k, begin = self._likeliest(sets, best.names)
                     if score > best.score + NEAR:
-                        begin = point_of(effects, sets.fit(best.names, k), best.names, self.along)
                         best = self.settled(best.names, begin, [levels[k]], best.score)
         return best
 
@@ -174,11 +174,9 @@ class Search:
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
         whole = self.settled(names, begin, [self.known[frozenset()].covariances.whitener()])
-        sets, levels = self.place(whole, names)
-        level = max(range(len(levels)), key=lambda k: float(sets.scores([names], k)[0]))
-        names = sets.pruned(names, level)
-        begin = point_of(self.composed.effects, sets.fit(names, level), names, self.along)
-        return self.settled(names, begin, [whole.whiten])
+        sets, _ = self.place(whole, names)
+        names = sets.pruned(names, self._likeliest(sets, names)[1])
+        return self.settled(names, self._likeliest(sets, names)[2], [whole.whiten])
 
     def _off(self, name: str, values: Mapping[str, float]) -> bool:
         known = self.composed.effects[name].parameters
@@ -188,14 +186,17 @@ class Search:
         """A given set at its best, and those with one less."""
         nothing = self.nothing()
         sets, levels = self.place(nothing, self.wanted)
-        scores = [sets.scores([names], level)[0] for level in range(len(levels))]
-        level = int(np.argmax(scores))
-        begin = point_of(self.composed.effects, sets.fit(names, level), names, self.along)
+        _, level, begin = self._likeliest(sets, names)
         found = self.settled(names, begin, [levels[level]])
         for out in names if len(names) > 1 else ():
             rest = tuple(n for n in names if n != out)
             self.settled(rest, without(found.point, out), [found.whiten])
         return found
+
+    def _likeliest(self, sets: Sets, names: Names) -> tuple[float, int, Point]:
+        """The score of a set in closed form, by the level that it is likeliest by, and where it has it."""
+        score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(sets.gram)))
+        return score, level, point_of(self.composed.effects, sets.fit(names, level), names, self.along)
 
     def nothing(self) -> Settled:
         """What is fitted along, alone; the simulator's own numbers are straight lines about where they are

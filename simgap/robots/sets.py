@@ -30,7 +30,6 @@ from simgap.robots.whiten import Whitener
 TURNS = 6  # numerics: of reweighted least squares
 ALIKE, SAME = 0.7, 0.99999  # numerics: correlations of columns that nearly cancel, and that are one
 SEEN = 1.0  # numerics: noise deviations that a usual size moves all rows by, together
-EXPECTED = 1.0  # prior: how many of all candidates act
 
 Names = tuple[str, ...]
 
@@ -250,12 +249,6 @@ def point_of(
     return out
 
 
-def log_odds(count: int) -> float:
-    """Prior log odds of one of so many candidates to act."""
-    share = min(EXPECTED / max(count, 1), 0.5)
-    return float(np.log(share / (1 - share)))
-
-
 def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
     """A point with one effect neutral."""
     return {n: v for n, v in point.items() if n != out}
@@ -273,7 +266,7 @@ def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str
     found = []
     for i, j in zip(*np.triu_indices(len(at), 1), strict=True):
         one, other = sets.names[single[i]], sets.names[single[j]]
-        closed = {(e.reads, e.command is not None) for e in (effects[one], effects[other])}
+        closed = {(e.alter is not None, e.command is not None) for e in (effects[one], effects[other])}
         if closed == {(True, False), (False, True)} and ALIKE < abs(alike[i, j]) < SAME:
             found.append((one, other, float(-alike[i, j] * length[i] / length[j])))
     return found

@@ -234,7 +234,7 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
     """What OLD logs tell of a robot that does not change, from the point of its calibration. The prior counts
     `dependence` times, as rows do not count singly."""
     point: Point = {} if calibration is None else {n: dict(v) for n, v in calibration.point.items()}
-    fitted = [e for e in point if not composed.numeric(e)]
+    fitted = [e for e in point if not composed.effects[e].numeric]
     runs = Runs(composed, point, unit)
     known = [composed.effects[e].parameters[s] for e in fitted for s in composed.effects[e].parameters]
     nominal, sd = np.array([q.nominal for q in known]), np.array([q.sd for q in known])

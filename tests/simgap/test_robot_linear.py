@@ -98,8 +98,7 @@ def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
         nominal = {n: p["nominal"] for n, p in robot.parameters.items()}
         planted = recording.with_columns({"angle": robot.simulate(nominal, acted)["angle"]})
     else:
-        read = made.read(recording.t - recording.t[0], recording["angle"], values)
-        planted = recording.with_columns({"angle": read})
+        planted = recording.with_columns(made.alter(recording, recording.columns, values))
     changed = composed([planted])
     before, _, _ = whitened(model)
     after, jacobian, _ = whitened(changed, effects=[effect])

@@ -68,7 +68,7 @@ def test_what_an_encoder_and_a_command_do_against_each_other_is_found(drawn):
     columns, residual, fold = drawn
     columns[:, 2] = -2.0 * columns[:, 1] + 0.1 * columns[:, 2]
     parameter, same = {"x": Parameter(0.0, 1.0)}, lambda *values: values[-2]
-    read, moved = RobotEffect("", "", parameter, read=same), RobotEffect("", "", parameter, command=same)
+    read, moved = RobotEffect("", "", parameter, alter=same), RobotEffect("", "", parameter, command=same)
     sets = sets_of(columns, residual, fold)
     ((one, other, against),) = cancelling(sets, {"a": read, "b": moved, "c": moved})
     assert (one, other) == ("a", "b") and against == pytest.approx(0.5, rel=0.05)

@@ -99,22 +99,17 @@ class _Catalogue:
         for j in joints:
             name, size = name_of(self.model, "joint", j), sizes_of(motions, j)
             head, torque, rate = f"joint:{name}", SHARE * size.torque, size.rate
-            stated = (
-                ("damping", torque / rate, "viscous friction"),
-                ("frictionloss", torque, "Coulomb friction"),
-                ("armature", torque / size.acceleration, "rotor inertia"),
-                ("stiffness", torque / size.reach, "stiffness of a spring or cable"),
-            )
-            for attribute, sd, what in stated:
+            for attribute, sd, low, what in (
+                ("damping", torque / rate, 0.0, "viscous friction of {}"),
+                ("frictionloss", torque, 0.0, "Coulomb friction of {}"),
+                ("armature", torque / size.acceleration, 0.0, "rotor inertia of {}"),
+                ("stiffness", torque / size.reach, 0.0, "stiffness of a spring or cable of {}"),
+                ("load_friction", SHARE, 0.0, "friction of {} in proportion to the torque transmitted"),
+                ("direction_friction", torque, -np.inf, "friction of {} larger one way than the other"),
+                ("quadratic_drag", torque / rate**2, 0.0, "drag on {} in proportion to the rate's square"),
+            ):
                 setting = setting_of(self.model, f"{head}.{attribute}")
-                self.add(setting.name, max(sd, SIZE * abs(setting.nominal)), f"{what} of {name}", low=0.0)
-            says = f"friction of {name} in proportion to the torque transmitted"
-            self.add(f"{head}.load_friction", SHARE, says, low=0.0)
-            self.add(
-                f"{head}.direction_friction", torque, f"friction of {name} larger one way than the other"
-            )
-            says = f"drag on {name} in proportion to the rate's square"
-            self.add(f"{head}.quadratic_drag", torque / rate**2, says, low=0.0)
+                self.add(setting.name, max(sd, SIZE * abs(setting.nominal)), what.format(name), low)
             says = f"friction of {name} larger near standstill, by extra exp(-(rate / speed)^2)"
             self.add(f"{head}.stribeck_extra", torque, says, low=0.0, effect=f"{head}.stribeck")
             speed = replace(setting_of(self.model, f"{head}.stribeck_speed"), nominal=0.3 * rate)
