@@ -28,7 +28,8 @@ MOST = 6  # numerics: effects of a set at most
 
 
 def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> list[Model]:
-    """All sets found within the window of the best, best first; the empty set is always one.
+    """All sets found within the window of the best, best first; the empty set is always one. Of a set whose
+    effects were linearised at several places the best counts.
 
     Neighbours of a set are screened from its mode in one step, leading ones in a few; what leads then is
     fitted to the end.
@@ -57,9 +58,12 @@ def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> li
             first = sorted(found, key=lambda m: -m.score)[:REFINED]
             seen |= {m.effects: fitted(f, m.effects) for m in first}
             rough |= {*new} - {*seen}
-    best = max(m.score for m in seen.values())
-    kept = [m for m in seen.values() if m.score > best - WINDOW or not m.effects]
-    return sorted(kept, key=lambda m: -m.score)
+    best, of = max(m.score for m in seen.values()), f.gap.candidates
+    kept: dict[tuple, Model] = {}
+    for m in sorted(seen.values(), key=lambda m: -m.score):
+        if m.score > best - WINDOW or not m.effects:
+            kept.setdefault(tuple(sorted((of[j].name, of[j].parameters) for j in m.effects)), m)
+    return list(kept.values())
 
 
 def _neighbours(f: Forms, effects: tuple[int, ...], among: list[int]) -> list[tuple[int, ...]]:

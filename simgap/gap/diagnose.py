@@ -14,9 +14,9 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
-from simgap.attribution.posterior import Model, fitted, forms
+from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.attribution.problem import Candidate, Gap
-from simgap.attribution.search import detected, sought, statistic
+from simgap.attribution.search import sought, statistic
 from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
 from simgap.effects import catalogue, effect_named, forms_of, free_parameters, name_of
 from simgap.effects.base import World, tips
@@ -381,10 +381,10 @@ def attributed(
     twins: Callable[[float], Iterable[float]] | None = None,
 ) -> tuple[Gap, Attribution]:
     """The attribution of a search, effects that act together linearised where they do."""
-    gap = found.gap
-    models: list[Model] | None = sought(forms(gap))
+    f, gap = forms(found.gap), found.gap
+    models: list[Model] | None = sought(f)
     if not forced:
-        gap, models = _after_first(found, gap, models)
+        gap, models = _after_first(found, f, models)
         leading = [c for j in models[0].effects if _shifts_signals(c := gap.candidates[j])]
         if leading:
             joint = _together(found, leading)
@@ -397,15 +397,13 @@ def attributed(
     return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
 
 
-def _after_first(found: Search, gap: Gap, models: list[Model]) -> tuple[Gap, list[Model]]:
+def _after_first(found: Search, f: Forms, models: list[Model]) -> tuple[Gap, list[Model]]:
     """The gap and its sets with every effect fitted after the first of the leading set, where this one alone
     leaves a gap: what another distorts looks like others by itself."""
-    f, best = forms(gap), models[0]
+    gap, best = f.gap, models[0]
     shifting = [j for j in best.effects if _shifts_signals(gap.candidates[j])]
-    if not shifting:
-        return gap, models
-    first = min(shifting, key=lambda j: fitted(f, tuple(i for i in best.effects if i != j)).score)
-    if len(best.effects) == 1 and detected(statistic(f, models, best.effects)).p_value >= ALARM:
+    first = min(shifting, key=lambda j: fitted(f, tuple(i for i in best.effects if i != j)).score, default=-1)
+    if first < 0 or statistic(f, models, (first,)) < NIL:
         return gap, models
     one = found.fits[first]
     keys = [k for each in found.fits if name_of(k := each.effects[0]) != gap.candidates[first].name]

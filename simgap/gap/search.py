@@ -37,6 +37,7 @@ from simgap.gap.problem import (
     slots,
     world_without,
 )
+from simgap.gap.residuals import SURE
 from simgap.progress import Progress, silent
 
 # Every candidate effect fitted by itself: all starts of its shape parameters screened, the best refined.
@@ -84,7 +85,7 @@ def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMI
     """
     base, usual = healthy.u.copy(), healthy.push[:, : given.num_properties]
     base[: given.num_properties][given.measured.ravel()] = 0.0
-    drawn = np.abs(healthy.u - base).max() > 1  # by more than their standard deviation
+    drawn = np.abs(healthy.u - base).max() > SURE  # by more than a touch is doubted
     every = [s for u in (base, healthy.u)[: 1 + drawn] for s in starts(given, key, healthy.effects, u)]
     ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < promising:
