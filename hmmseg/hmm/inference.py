@@ -310,8 +310,9 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any]
                 np.asarray, program(x, _padded(chain, len(ll)), np.int32(len(ll)), *keys)
             )
         if not np.isfinite(total):
-            why = durations.why_infeasible if isinstance(chain, DurationChain) else why_infeasible
-            raise why(ll, chain)
+            if isinstance(chain, DurationChain):
+                raise durations.why_infeasible(ll, chain)
+            raise why_infeasible(ll, chain)
         found.append(_trimmed(result, len(ll)))
     return found
 

@@ -103,16 +103,15 @@ def pooled(
 
     readings, fitted, sensing = once()
     if sensing.late:
-        *second, again = once(sensing)
+        read_anew, fitted_anew, again = once(sensing)
         if not again.heights_gain(sensing) > decisive(0.5):  # a sensor's delay is common to all forces
             sensing = replace(sensing, delay=0.0, delay_sd=LEAD_SD, late=False, filter=False)
         else:
-            readings, fitted = second
+            readings, fitted = read_anew, fitted_anew
             doubt = float(np.hypot(again.delay_sd, sensing.delay_sd))
-            sensing = replace(sensing, normal=again.normal, shear=again.shear, friction=again.friction)
+            sensing = replace(again, late=True, filter=sensing.filter, delay=sensing.delay, delay_sd=doubt)
     remarks, late = sensing.remarks(rig), sensing.late
-    if late:  # of what was read again nothing is late any more
-        sensing = replace(sensing, delay=0.0, delay_sd=doubt)
+    sensing = replace(sensing, delay=0.0) if late else sensing  # what was read again is late no more
     changes = [
         contact_changes(readings[i].fine, readings[i].thinned, sensing, steps, fitted.parameters, alignment)
         for i, alignment in zip(fitting, fitted.posteriors, strict=True)

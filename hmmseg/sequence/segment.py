@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -248,19 +247,8 @@ def _boundary(
 
 
 def _shortest(middle: np.ndarray, cumulative: np.ndarray) -> tuple[float, float]:
-    """The shortest interval that holds 90 % of what rises linearly between `cumulative` at `middle`.
-
-    Between two of them its length is linear in where it begins, so that one of its ends is at one.
-    """
-
-    def reached(level: np.ndarray, side: Literal["left", "right"]) -> np.ndarray:
-        """Where a level is first reached ("left"), or last left behind: they differ where nothing is."""
-        i = np.clip(np.searchsorted(cumulative, level, side), 1, middle.size - 1)
-        rise = np.maximum(cumulative[i] - cumulative[i - 1], np.finfo(float).tiny)
-        share = np.clip((level - cumulative[i - 1]) / rise, 0.0, 1.0)
-        return middle[i - 1] + share * (middle[i] - middle[i - 1])
-
-    below = np.r_[cumulative[cumulative <= 0.1], cumulative[cumulative >= 0.9] - 0.9]
-    lows, highs = reached(below, "right"), reached(np.minimum(below + 0.9, 1.0), "left")
-    shortest = int(np.argmin(highs - lows))
-    return float(lows[shortest]), float(highs[shortest])
+    """The shortest interval between two of the times `middle` that holds 90 % of what is `cumulative`."""
+    stop = np.searchsorted(cumulative, cumulative + 0.9)
+    start = np.flatnonzero(stop < middle.size)
+    shortest = start[np.argmin(middle[stop[start]] - middle[start])]
+    return float(middle[shortest]), float(middle[stop[shortest]])

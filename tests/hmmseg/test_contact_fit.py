@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from scipy import optimize, stats
-from scipy.integrate import quad
 from scipy.stats import norm
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask, subtasks
 from hmmseg.contact.equations import Pads
-from hmmseg.densities import log_between, log_student_below
-from hmmseg.hmm import Chain, InfeasibleAlignment, em
+from hmmseg.densities import log_student_below
+from hmmseg.hmm import Chain, em
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.segmentation import fit as contact_fit
@@ -127,15 +126,6 @@ def step(state: str) -> tuple[Subtask, ...]:
 
 def score(f: Features, state: str) -> np.ndarray:
     return log_likelihoods(f, step(state), PARAMETERS, 0)[:, 0]
-
-
-def test_soft_uniform_is_a_density():
-    def density(x):
-        return float(np.exp(log_between(np.array([x]), 0.5, 4.0, 0.05))[0])
-
-    total, _ = quad(density, -1, 6, points=[0.5, 4.0], epsabs=1e-9)
-    # Both soft edges together lose what one edge's noise carries beyond the other: nothing here.
-    np.testing.assert_allclose(total, 1.0, atol=1e-6)
 
 
 def test_ungripped_force_density_integrates_to_one():
@@ -264,13 +254,6 @@ def test_location_and_scale_maximise_the_weighted_student_likelihood():
     assert found == pytest.approx(np.exp(at_location.x), rel=0.02)
 
 
-def test_pieces_without_data_keep_what_they_had():
-    nothing = np.full(3, np.nan)
-    assert _location(nothing, np.ones(3), 1.0, 0.7) == 0.7
-    assert _scale(nothing, np.ones(3), 0.3, 0.1) == 0.3
-    assert _scale(np.zeros(100), np.ones(100), 0.3, 0.1) == 0.1  # never below its floor
-
-
 def test_transitions_are_probabilities_with_the_mean_duration():
     stay, advance = chain_of(np.array([0.25, 0.5, 0.25]), 200).bands
     np.testing.assert_allclose(np.exp(stay[:2]) + np.exp(advance), 1.0)
@@ -356,20 +339,6 @@ def recorded():
     )
 
 
-def test_log_evidence_and_responsibilities_are_those_of_enumeration():
-    trials = recorded()
-    fit = learn_level(trials, 1.5, max_iterations=1)
-    assert fit.log_evidence == pytest.approx(by_enumeration(trials, 1.5), abs=1e-9)
-    assert (fit.num_iterations, fit.converged) == (1, False)
-    x = trials[3]
-    weights = np.array([
-        np.exp(norm.logpdf(x[:c]).sum() + norm.logpdf(x[c:], 1.5).sum())
-        * STAY ** (c - 1) for c in range(1, x.size)
-    ])  # fmt: skip
-    late = [weights[:t].sum() / weights.sum() for t in range(x.size)]
-    np.testing.assert_allclose(fit.alignments[3].smoothed[:, 1], late, atol=1e-9)
-
-
 def test_em_ends_at_the_maximum_of_the_evidence():
     trials = recorded()
     fit = learn_level(trials, 0.7, max_iterations=500, tolerance=1e-10)
@@ -377,9 +346,3 @@ def test_em_ends_at_the_maximum_of_the_evidence():
     best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
     assert fit.model == pytest.approx(best.x, abs=1e-3)
     assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.model), abs=1e-9)
-
-
-def test_a_trial_too_short_says_which_state_starves():
-    with pytest.raises(InfeasibleAlignment) as error:
-        learn_level((np.zeros(4), np.zeros(1)), 1.0)
-    assert error.value.subtask == 1
