@@ -99,10 +99,10 @@ def verdict_on(
             {*s.causes} for s in sets if s.causes and cause not in s.causes and len(s.causes) <= len(causes)
         ]
         stands_in[cause] = tuple(sorted(set().union(*rivals) - {*causes}))
-    rest = Remainder(left if named else float(verdict.verdict != "none"), _alone(best), ())
     told = verdict.verdict != "none"
     where = _where(search, nothing, phases) if told else ()
-    rest = Remainder(rest.share, rest.p_value, _where(search, best, phases) if told and best.names else where)
+    left_where = _where(search, best, phases) if told and best.names else where
+    rest = Remainder(left if named else float(told), _alone(best), left_where)
     return RobotVerdict(
         **vars(verdict), detection=gap, remainder=rest, where=where, shares=shares, shared=best.names,
         chance=dict.fromkeys(search.wanted, 0.0) | acting(sets, gap.p_value), over_noise=over_noise,
