@@ -172,12 +172,17 @@ class Heldout:
         n, gone = float(floor.sum()), fraction_gone(before - after, before - floor)
         return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *gone, self.gain(effects, ()))
 
-    def gain(self, effects: Sequence[int], without: Sequence[int], off: Sequence[int] = ()) -> float:
-        """Log predictive density of all trials by a set of effects over that by another [nats], and what else
-        speaks for them; forms of the effects that may be `off` are no better than they usually are."""
+    def gain(self, effects: Sequence[int], without: Sequence[int]) -> float:
+        """Log predictive density of all trials by a set of effects over that by another [nats]."""
+        return float(self.gains(effects, without).sum())
+
+    def gains(self, effects: Sequence[int], without: Sequence[int], off: Sequence[int] = ()) -> np.ndarray:
+        """The same of every trial, and of what was measured apart (K + 1,), with what else speaks for a set;
+        forms of effects that may be `off` are no better than they usually are."""
         (more, wide), (less, plain) = self._squares(effects, off), self._squares(without, off)
-        known = [sum(self.evidence[j] for j in which) for which in (effects, without)]
-        return 0.5 * float((less + plain - more - wide).sum()) + known[0] - known[1]
+        known = sum(self.evidence[j] for j in effects) - sum(self.evidence[j] for j in without)
+        gained = 0.5 * (less + plain - more - wide)
+        return gained + known / len(self.folds) * (np.arange(gained.size) < len(self.folds))
 
     def _squares(self, effects: Sequence[int], off: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
         key, loose = (tuple(sorted(self.among.index(j) for j in which)) for which in (effects, off))
