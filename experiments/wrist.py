@@ -176,7 +176,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path, nargs="?", default=ARM)
-    parser.add_argument("--seeds", type=int, default=2, help="performances of each setup")
+    parser.add_argument("--seeds", type=int, default=3, help="performances of each setup")
     parser.add_argument("--only", help="setups whose name holds this, printed and not saved")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
