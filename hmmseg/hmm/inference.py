@@ -34,6 +34,7 @@ from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filter
 
 AnyChain = Chain | DurationChain
 SHORTEST = 128  # numerics: samples; the first step of the ladder of lengths
+TOGETHER = 64  # numerics: recordings of one shape that make one call; what is over is done one by one
 MAX_RANKS = 65_535  # limit: of k_best
 
 
@@ -296,24 +297,37 @@ def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
 
 def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any], *keys: Any,
              parallel: bool | None = None, **static: Any) -> list:  # fmt: skip
-    """The core on checked recordings, each padded to the ladder: one program for all of one length.
+    """The core on checked recordings, each padded to the ladder: one program for all of one shape.
 
     Raises InfeasibleAlignment, and ValueError for +inf.
     """
     if parallel is None:
         parallel = jax.default_backend() != "cpu"
-    program, found = compiled(core, parallel=parallel, **static), []
-    for ll, chain in zip(tables, chains, strict=True):
-        x = np.pad(ll, ((0, ladder(len(ll)) - len(ll)), (0, 0)))
-        with jax.enable_x64(True):
-            total, result = jax.tree.map(
-                np.asarray, program(x, _padded(chain, len(ll)), np.int32(len(ll)), *keys)
-            )
-        if not np.isfinite(total):
-            if isinstance(chain, DurationChain):
-                raise durations.why_infeasible(ll, chain)
-            raise why_infeasible(ll, chain)
-        found.append(_trimmed(result, len(ll)))
+    padded = [_padded(chain, len(ll)) for ll, chain in zip(tables, chains, strict=True)]
+    groups: dict[Any, list[int]] = {}
+    for i, (ll, chain) in enumerate(zip(tables, padded, strict=True)):
+        leaves, kind = jax.tree.flatten(chain)
+        groups.setdefault((ladder(len(ll)), kind, *(np.shape(leaf) for leaf in leaves)), []).append(i)
+    found: list[Any] = [None] * len(tables)
+    for (size, *_), members in groups.items():
+        whole = len(members) // TOGETHER * TOGETHER
+        parts = [members[i : i + TOGETHER] for i in range(0, whole, TOGETHER)] + [
+            [i] for i in members[whole:]
+        ]
+        for part in parts:
+            n = np.array([len(tables[i]) for i in part], np.int32)
+            x = np.zeros((len(part), size, tables[part[0]].shape[1]))
+            for row, i in zip(x, part, strict=True):
+                row[: len(tables[i])] = tables[i]
+            chain = jax.tree.map(lambda *leaves: np.stack(leaves), *(padded[i] for i in part))
+            with jax.enable_x64(True):
+                program = compiled(core, parallel, tuple(sorted(static.items())))
+                totals, results = jax.tree.map(np.asarray, program(x, chain, n, *keys))
+            for j, i in enumerate(part):
+                if not np.isfinite(totals[j]):
+                    why = durations.why_infeasible if isinstance(chains[i], DurationChain) else why_infeasible
+                    raise why(tables[i], chains[i])
+                found[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], results), len(tables[i]))
     return found
 
 
@@ -328,9 +342,17 @@ def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> lis
 
 
 @cache
-def compiled(core: Callable, **static: Any) -> Callable:
-    """The core as a program."""
-    return jax.jit(partial(core, **static))
+def compiled(core: Callable, parallel: bool, static: tuple) -> Callable:
+    """The core for several recordings as one program."""
+    kws = dict(static, parallel=parallel)
+
+    def run(x: jax.Array, chain: Any, n: jax.Array, *keys: jax.Array) -> Any:
+        def one(args: tuple) -> Any:
+            return core(*args, *keys, **kws)
+
+        return jax.vmap(one)((x, chain, n)) if parallel else jax.lax.map(one, (x, chain, n))
+
+    return jax.jit(run)
 
 
 def _padded(chain: AnyChain, num_samples: int) -> AnyChain:
