@@ -318,6 +318,17 @@ def test_causes_are_those_without_which_other_trials_are_predicted_worse():
     assert held.gain((0, 2), (0,)) > 3 > held.gain((0, 1, 2), (0, 2))
 
 
+def test_what_one_trial_alone_says_is_an_accident():
+    """Beside a cause that all trials show, one that a single trial shows as much as all of them together."""
+    gap = gap_of({0: 4.0}, seed=4)
+    push, own = gap.candidates[2].jacobian[:, 0], gap.rows.trial == 1
+    for where, causes in ((own, (0,)), (np.ones_like(own), (0, 2))):
+        more = 6.0 * push * where
+        held = Heldout.of(replace(gap, residual=gap.residual + more), np.ones(3), range(4))
+        assert held is not None and held.gain((0, 2), (0,)) > 3
+        assert _predicting(held, (0, 2)) == causes
+
+
 def test_what_helps_the_trials_it_was_found_in_alone_is_no_cause():
     """Half a gap is one trial's: an effect that takes it makes no other smaller."""
     gap = gap_of({}, seed=5)

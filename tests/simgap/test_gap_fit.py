@@ -9,9 +9,10 @@ from demo_recordings import RECORDINGS, recorded
 
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
+from simgap.attribution.problem import cosines
 from simgap.effects import effect_named
-from simgap.gap.assemble import gap_of, scatters, together
-from simgap.gap.frame import build
+from simgap.gap.assemble import after, gap_of, rows_of, scatters, together
+from simgap.gap.frame import CHANNELS, build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import Start, derivatives, fit, neutral, problem, slots
 
@@ -82,6 +83,38 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
     left = gap.residual - gap.nuisance[:, : given.num_properties] @ joint.u[: given.num_properties]
     left = left - sum(c.shift for c in gap.candidates)
     np.testing.assert_allclose(left, joint.residual, atol=1e-8)
+
+
+@double_precision
+def test_an_effect_fitted_after_another_adds_to_it_what_both_take_off(healthy):
+    frame = healthy[0].frame
+    given = problem(replace(frame, world=frame.world._replace(give_normal=0.5 * frame.world.give_normal)))
+    plain = fit(given, Start((), neutral(given)))
+    first = fit(given, Start(("fingertip_compliance",), plain.u))
+    joint = fit(given, Start((*first.effects, "link_length"), first.u))
+    gap = after(given, gap_of(given, plain, [first]), plain, first, [joint], ())
+    one, other = gap.candidates
+    assert (one.name, other.name) == ("fingertip_compliance", "link_length")
+    k = given.num_properties
+    left = gap.residual - gap.nuisance[:, :k] @ joint.u[:k] - other.shift
+    left = left - one.shift - one.jacobian @ (joint.u[first.columns[k:]] - one.at)
+    np.testing.assert_allclose(left, joint.residual, atol=1e-8)
+
+
+@double_precision
+def test_a_scatter_is_as_large_as_it_was_before_nuisances_took_of_it(healthy):
+    """Kept variances, against the dense projection of independent coefficients."""
+    given = with_nuisances(healthy[0])
+    rows, rng = rows_of(given), np.random.default_rng(0)
+    variance = np.where(rows.channel == CHANNELS.index("offset"), 9.0, 0.0)
+    columns = cosines(rows, given.nuisances.columns)[0]
+    drawn = np.sqrt(variance)[:, None] * rng.standard_normal((variance.size, 400))
+    left = drawn - columns @ np.linalg.solve(
+        np.eye(columns.shape[1]) + columns.T @ columns, columns.T @ drawn
+    )
+    mine, kept = variance > 0, given.nuisances.kept(rows, variance)
+    assert kept[mine].sum() == pytest.approx(np.square(left[mine]).mean(1).sum(), rel=0.02)
+    assert kept[mine].min() < 0.9 * 9.0 and (kept[~mine] == 0).all()
 
 
 @double_precision
