@@ -373,14 +373,10 @@ def after(
 
     def on(other: Problem) -> Gap:
         plain = on_other(other, healthy)
-        return of(other, plain, *_alike(other, plain, first), [*_alike(other, plain, *joint)])
+        one, *others = (on_other(other, f, plain.push) for f in (first, *joint))
+        return of(other, plain, one, others)
 
     return _carrying(gap, of(given, healthy, first, joint), redrawn, on)
-
-
-def _alike(other: Problem, healthy: Fitted, *fits: Fitted) -> list[Fitted]:
-    """Fits on another recording, where the `healthy` one is known."""
-    return [on_other(other, f, healthy.push) for f in fits]
 
 
 def _carrying(gap: Gap, more: Gap, redrawn: Sequence[Problem], on: Callable[[Problem], Gap]) -> Gap:

@@ -85,7 +85,8 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
     step, pushed, every = mujoco.mj_step, data.qfrc_applied, model.dof_frictionloss
     # A view gives and takes plain numbers, several times as fast as an array.
     seen = every, data.qvel, data.qfrc_actuator, data.qfrc_bias, data.actuator_force
-    limit, rate, motor, bias, force = map(memoryview, seen)
+    views: list[Any] = [memoryview(each) for each in seen]
+    limit, rate, motor, bias, force = views
     extra = bool(laws.fading) or any(f.drag for f in laws.friction)
     try:
         for b in range(len(first)):
