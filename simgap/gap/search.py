@@ -300,7 +300,10 @@ def _recovered(
     if len(aligned.trials) == len(every.trials):
         return None
     forced = align([one.trial for one in every.trials], every.task, every.rig, all_fit=True)
-    again = realigned(forced, rebased(build(forced), given), best)
+    frame = build(forced)
+    if not np.isfinite(frame.world.events).all():  # nowhere in these trials a block could be held
+        return None
+    again = realigned(forced, rebased(frame, given), best)
     fit_now = tuple(one for one in again.trials if one.segmentation.failed is None)
     return replace(again, trials=fit_now) if len(fit_now) > len(aligned.trials) else None
 
