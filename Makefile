@@ -100,10 +100,10 @@ gap-labs: $(INSTALLED)  ## diagnoses of open labs in the folder LABS; fills docs
 
 FRESH := experiments/results/gap_fresh.json
 gap-fresh: $(INSTALLED)  ## diagnoses of labs of our own second simulator, drawn anew; fills docs/gap_results.md
-	$(BIN)/python -m experiments.blind_check open --cases 36 --seed 271131 --out build/healthy
-	$(BIN)/python -m experiments.blind_check open --cases 24 --seed 271141 --tiers single pair outside --out build/acting
-	$(BIN)/python -m experiments.gap_drawn build/healthy --results build/healthy_found --run "seed 271131" --output $(FRESH)
-	$(BIN)/python -m experiments.gap_drawn build/acting --results build/acting_found --run "seed 271141" --output $(FRESH)
+	$(BIN)/python -m experiments.blind_check open --cases 36 --seed 271161 --out build/healthy
+	$(BIN)/python -m experiments.blind_check open --cases 36 --seed 271171 --tiers single pair outside --out build/acting
+	$(BIN)/python -m experiments.gap_drawn build/healthy --results build/healthy_found --run "seed 271161" --output $(FRESH)
+	$(BIN)/python -m experiments.gap_drawn build/acting --results build/acting_found --run "seed 271171" --output $(FRESH)
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
