@@ -321,7 +321,7 @@ def _needed(f: Forms, model: Model, effect: int) -> bool:
     if not others:
         return True
     feigned = max(f.gap.candidates[j].form for j in others) * (model.score - fitted(f, ()).score)
-    return model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned)
+    return bool(model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned))
 
 
 def _effects(

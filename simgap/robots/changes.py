@@ -230,7 +230,7 @@ class Comparison:
     def leaves(self, change: Change) -> bool:
         """Whether NEW's logs are fitted worse than OLD's motions are by fits that did not see them."""
         count = np.bincount(np.searchsorted(self.runs.units, self.runs.unit))
-        return change.energy > float(count @ self.missed) / self.old.dependence
+        return bool(change.energy > float(count @ self.missed) / self.old.dependence)
 
     @property
     def paired(self) -> bool:
