@@ -18,46 +18,60 @@ from estimation import priors
 from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode
 from hmmseg.tables import Brief
 
-TAIL = 5.0  # numerics: degrees of freedom of proposals, which need heavier tails than the posterior
-WIDEN = 1.2  # numerics: of the Laplace covariance, likewise
-FROM_PRIOR = 0.3  # numerics: share of proposals whose scatters are of a t about their prior's medians
+TAIL = 5.0  # numerics: degrees of freedom for the noise: proposals need heavier tails than the posterior
+WIDEN = 1.1  # numerics: of the Laplace covariance, likewise
+# numerics: share of proposals whose scatter is a t about its prior's median, heavier than any posterior
+FROM_PRIOR = 0.1
+STEP, REACH = 0.25, (-10.0, 10.0)  # numerics: of the grid, in log(share / its prior median)
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A mixture of two t: all scales as Laplace has them, or the noise so and scatters as their prior.
+    """Multivariate t of the noise scales: `mean` (3,), `chol` (3, 3); densities (3, G) of the scatters.
 
-    `mean` (6,) and `chol` (6, 6) of the one, `prior_mean` and `prior_chol` of the other.
+    `cells` are probabilities of the grid's intervals, of width STEP from REACH[0] on.
     """
 
     mean: np.ndarray
     chol: np.ndarray
-    prior_mean: np.ndarray
-    prior_chol: np.ndarray
+    cells: np.ndarray
 
     def draw(self, num: int, random: np.random.RandomState) -> np.ndarray:
         """Proposals (num, 6)."""
-        z = random.normal(size=(num, len(self.mean))) / np.sqrt(random.chisquare(TAIL, (num, 1)) / TAIL)
-        from_prior = random.uniform(size=(num, 1)) < FROM_PRIOR
-        return np.where(from_prior, self.prior_mean + z @ self.prior_chol.T, self.mean + z @ self.chol.T)
+        chi2 = random.chisquare(TAIL, size=(num, 1)) / TAIL
+        noise = self.mean + random.normal(size=(num, NUM_CHANNELS)) / np.sqrt(chi2) @ self.chol.T
+        cumulative = np.cumsum(self.cells, axis=1)
+        chosen = [np.searchsorted(row / row[-1], random.uniform(size=num)) for row in cumulative]
+        scatter = REACH[0] + STEP * (np.stack(chosen, axis=1) + random.uniform(size=(num, NUM_CHANNELS)))
+        prior = priors.SCATTER_LOG_SD * random.standard_t(TAIL, size=scatter.shape)
+        from_prior = random.uniform(size=scatter.shape) < FROM_PRIOR
+        return np.concatenate([noise, np.where(from_prior, prior, scatter)], axis=1)
 
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Log density (num,) of proposing x (num, 6)."""
-        near, far = (
-            _log_student((np.linalg.solve(chol, (x - mean).T) ** 2).sum(axis=0), TAIL, len(mean))
-            - np.log(np.diag(chol)).sum()
-            for mean, chol in ((self.mean, self.chol), (self.prior_mean, self.prior_chol))
-        )
-        return np.logaddexp(np.log(1 - FROM_PRIOR) + near, np.log(FROM_PRIOR) + far)
+        z = np.linalg.solve(self.chol, (x[:, :NUM_CHANNELS] - self.mean).T)
+        out = _log_student((z**2).sum(axis=0), TAIL, NUM_CHANNELS) - np.log(np.diag(self.chol)).sum()
+        scatter = x[:, NUM_CHANNELS:]
+        cell = np.floor((scatter - REACH[0]) / STEP).astype(int)
+        inside = (cell >= 0) & (cell < self.cells.shape[1])
+        drawn = self.cells[np.arange(NUM_CHANNELS), np.where(inside, cell, 0)] / STEP
+        z2 = (scatter / priors.SCATTER_LOG_SD) ** 2
+        prior = np.exp(_log_student(z2, TAIL, 1)) / priors.SCATTER_LOG_SD
+        return out + np.log((1 - FROM_PRIOR) * np.where(inside, drawn, 0.0) + FROM_PRIOR * prior).sum(axis=1)
 
 
-def proposal(mode: Mode) -> Proposal:
+def proposal(post: Posterior, mode: Mode) -> Proposal:
     """The proposal about a mode."""
-    noise = slice(NUM_CHANNELS)
-    mean, covariance = np.zeros(2 * NUM_CHANNELS), np.eye(2 * NUM_CHANNELS) * priors.SCATTER_LOG_SD**2
-    mean[noise], covariance[noise, noise] = mode.scales[noise], WIDEN * mode.covariance[noise, noise]
-    laplace = np.linalg.cholesky(WIDEN * mode.covariance)
-    return Proposal(mode.scales, laplace, mean, np.linalg.cholesky(covariance))
+    middle = np.arange(REACH[0] + STEP / 2, REACH[1], STEP)
+    cells = []
+    for c in range(NUM_CHANNELS):
+        along = np.repeat(mode.scales[None], middle.size, axis=0)
+        along[:, NUM_CHANNELS + c] = middle
+        log_prob = post.log_prob(along)
+        cells.append(np.exp(log_prob - log_prob.max()))
+    noise = WIDEN * mode.covariance[:NUM_CHANNELS, :NUM_CHANNELS]
+    found = np.stack([row / row.sum() for row in cells])
+    return Proposal(mode.scales[:NUM_CHANNELS], np.linalg.cholesky(noise), found)
 
 
 def _log_student(z2: np.ndarray, tail: float, dim: int) -> np.ndarray:
@@ -131,7 +145,7 @@ def sample(
 
     mode = find_mode(post) if mode is None else mode
     random = np.random.RandomState(seed)
-    independent = proposal(mode)
+    independent = proposal(post, mode)
     start = independent.draw(WALKERS, random)
 
     def anew(x: np.ndarray, random: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:

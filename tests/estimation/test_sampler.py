@@ -13,7 +13,7 @@ from estimation.sampler import GROUPS, MIN_ESS, effective_sample_size, proposal,
 
 def importance(post, mode, seed, num):
     """Draws (num, 6) of the proposal and their normalised importance weights (num,)."""
-    independent = proposal(mode)
+    independent = proposal(post, mode)
     x = independent.draw(num, np.random.RandomState(seed))
     log_weight = post.log_prob(x) - independent.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
@@ -46,7 +46,7 @@ def ar1(shape, rho, rng):
 
 def test_scales_have_the_moments_of_importance_sampling(post, mode, draws):
     x, weight = importance(post, mode, 5, 20_000)
-    assert 1 / (weight**2).sum() > 0.4 * len(x)  # the proposal is close, so its weights are even
+    assert 1 / (weight**2).sum() > 0.6 * len(x)  # the proposal is close, so its weights are even
     mean = weight @ x
     sd = np.sqrt(weight @ (x - mean) ** 2)
     flat = draws.scales.reshape(-1, 6)
@@ -112,7 +112,7 @@ def test_the_same_seed_draws_the_same(post, draws):
 
 def test_density_of_the_proposal_integrates_to_one(post, mode):
     """The mean of p / q over q's draws, p a Gaussian narrower than q, is 1."""
-    found = proposal(mode)
+    found = proposal(post, mode)
     draws = found.draw(40_000, np.random.RandomState(1))
     chol = np.linalg.cholesky(0.3 * mode.covariance)
     z = np.linalg.solve(chol, (draws - mode.scales).T)
