@@ -34,7 +34,6 @@ from dataclasses import dataclass
 from itertools import pairwise, product
 
 import numpy as np
-from scipy.special import softmax
 
 from estimation.design import RISE, Design, PadDoubt
 from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
@@ -328,49 +327,38 @@ def _heights(design: Design) -> dict[str, float]:
     return {u.name[0]: float(v) for u, v in zip(unknowns, found, strict=True) if u.single}
 
 
-MISREAD = 0.25  # prior: share of forces among what is to blame where pads and forces contradict each other
+MISREAD = 0.5  # prior: share of forces among what is to blame where pads and forces contradict each other
 GAIN_LOG_SD = 1.0  # prior: of log g: another range or unit of the amplifier
 PADS_LOG_SD = 0.8  # prior: of a wrong stiffness: foams of another kind are a third or three times as stiff
 NOISE_LOG_SD, AXIS_LOG_SD = 0.35, 0.3  # prior: noise is off its statement by a factor of two once in twenty
-UNSEEN = 10.0  # numerics: sd of a logarithm of which nothing is known
-# physics: how pads' compliances (along the grip, in shear) and noise (x, y) look, all in logarithms, where
-# nothing is wrong, pads are softer, or forces of both axes or the vertical ones are read too large
-EXPLANATIONS = np.array([
-    [0, 0, 0, 0], [1, 1, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [-1, -1, 1, 1], [0, -1, 0, 1]
-])  # fmt: skip
-SDS = np.array([0.0, *[PADS_LOG_SD] * 3, *[GAIN_LOG_SD] * 2])  # prior: of these
-# prior: probabilities of these
-ODDS = np.array([1 - MISSTATED, *[MISSTATED * (1 - MISREAD) / 3] * 3, *[MISSTATED * MISREAD / 2] * 2])
+GRID = np.linspace(np.log(1e-3), np.log(1e3), 2001)  # numerics: log g; twice a third of a percent a step
 TELLING = 1.0  # limit: sd of the pads' share along the grip, from which grips show nothing of it
 
 
 @dataclass(frozen=True)
 class ForceScale:
-    """The posterior of g, by which vertical forces are read too large, in two explanations.
+    """The posterior of g (GRID,), by which vertical forces are read too large, and that of any g but 1.
 
-    `odds` (2,) that forces are misread so; `mean` and `sd` (2,) of the normal log g if they are.
+    `probability` that forces are misread; `density` (len(GRID),) of log g if they are.
     """
 
-    odds: np.ndarray
-    mean: np.ndarray
-    sd: np.ndarray
+    probability: float
+    density: np.ndarray
 
     def corrected(self, chain: np.ndarray, weights: list[int], rng: np.random.Generator) -> np.ndarray:
         """Draws (walkers, steps, Q), those of `weights` [N] with g drawn from its posterior."""
         out, size = chain.copy(), chain.shape[:2]
-        which = rng.choice(3, size, p=[*self.odds, 1 - self.odds.sum()])
-        log_g = rng.normal([*self.mean, 0.0], [*self.sd, 0.0], (*size, 3))
-        out[..., weights] *= np.exp(-np.take_along_axis(log_g, which[..., None], -1))
+        misread = rng.uniform(size=size) < self.probability
+        out[..., weights] *= np.exp(-(misread * rng.choice(GRID, size, p=self.density)))[..., None]
         return out
 
     def remark(self) -> str:
         """What contradicts what, for people."""
-        probability = float(self.odds.sum())
-        g = float(np.exp(self.odds @ self.mean / probability))
+        g = float(np.exp(self.density @ GRID))
         size = f"{g:.2g} times too large" if g > 1 else f"{1 / g:.2g} times too small"
         return (
             f"forces and [fingertip] contradict each other: forces are read {size} with a probability of "
-            f"{probability:.0%}, or the pads are not as stated; weights allow for both, and a weighed "
+            f"{self.probability:.0%}, or the pads are not as stated; weights allow for both, and a weighed "
             "block would tell"
         )
 
@@ -380,32 +368,60 @@ def force_scale(
 ) -> ForceScale | None:
     """The scale of forces where pads and noise say anything against 1; None where nothing does.
 
-    Not to be used where forces come late, which makes slopes of readings over them flat. What is seen are
-    logarithms: of the pads' compliances over the stated ones, along the grip and in shear, and of the noise
-    of both axes over its statement. Each explanation moves them along a line by a normal amount.
+    Not to be used where forces come late, which makes slopes of readings over them flat.
     """
     tip = rig.fingertip
     if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
         return None
-    if doubts["normal"].seen[1] > TELLING:
+    (normal, normal_sd), (shear, shear_sd) = (doubt.seen for doubt in doubts.values())
+    if normal_sd > TELLING:
         return None
-    seen, covariance = np.zeros(4), UNSEEN**2 * np.eye(4)
-    for k, (share, sd) in enumerate(doubt.seen for doubt in doubts.values()):
-        if np.isfinite(sd):
-            soft = max(1 + share, sd / 2)  # noise alone may make it less than nothing
-            seen[k], covariance[k, k] = np.log(soft), (sd / soft) ** 2 + SLOPE_SD**2
-    excess = _noise_excess(weighed, rig)
-    if excess is not None:
-        seen[2:], covariance[2:, 2:] = excess, NOISE_LOG_SD**2 + AXIS_LOG_SD**2 * np.eye(2)
+    share = np.expm1(-GRID)  # of compliance beyond the stated one, where forces are g times too large
 
-    every = covariance + (SDS[:, None, None] ** 2) * EXPLANATIONS[:, :, None] * EXPLANATIONS[:, None, :]
-    fit = (seen * np.linalg.solve(every, seen)).sum(axis=1)
-    odds = softmax(np.log(ODDS) - (fit + np.linalg.slogdet(every)[1]) / 2)[4:]
-    if odds.sum() <= MISSTATED * MISREAD:  # no likelier than before grips are seen
+    def pads(of_normal: np.ndarray | float, of_shear: np.ndarray | float) -> np.ndarray:
+        """Log likelihood (len(GRID),) of both shares where truly these."""
+        out = np.zeros(GRID.size)
+        for seen, sd, true in ((normal, normal_sd, of_normal), (shear, shear_sd, of_shear)):
+            if np.isfinite(sd):
+                error = np.hypot(sd, SLOPE_SD * (1 + np.asarray(true)))
+                out = out - 0.5 * ((seen - true) / error) ** 2 - np.log(error)
+        return out
+
+    excess = _noise_excess(weighed, rig)
+
+    def noise(of_x: np.ndarray | float, of_y: np.ndarray | float) -> np.ndarray:
+        """Log likelihood of the noise of both axes, read `of` (logarithms) times too large."""
+        if excess is None:
+            return np.zeros(GRID.size)
+        covariance = np.full((2, 2), NOISE_LOG_SD**2) + AXIS_LOG_SD**2 * np.eye(2)
+        off = np.stack(np.broadcast_arrays(excess[0] - of_x, excess[1] - of_y, GRID)[:2])
+        return -0.5 * (off * np.linalg.solve(covariance, off)).sum(axis=0)
+
+    def normal_prior(sd: float) -> np.ndarray:
+        density = np.exp(-0.5 * (GRID / sd) ** 2)
+        return np.log(density / density.sum())
+
+    def evidence(log_likelihood: np.ndarray, sd: float) -> float:
+        return float(np.logaddexp.reduce(normal_prior(sd) + log_likelihood))
+
+    wrong_pads = (pads(share, share), pads(share, 0.0), pads(0.0, share))
+    foam = max(evidence(each, PADS_LOG_SD) for each in wrong_pads)
+    both, vertical = pads(share, share) + noise(GRID, GRID), pads(0.0, share) + noise(0.0, GRID)
+    right = float((pads(0.0, 0.0) + noise(0.0, 0.0))[0])
+    log_odds = np.array([
+        np.log(1 - MISSTATED) + right,
+        np.log(MISSTATED * (1 - MISREAD)) + foam + float(noise(0.0, 0.0)[0]),
+        np.log(MISSTATED * MISREAD / 2) + evidence(both, GAIN_LOG_SD),
+        np.log(MISSTATED * MISREAD / 2) + evidence(vertical, GAIN_LOG_SD),
+    ])  # fmt: skip
+    odds = np.exp(log_odds - np.logaddexp.reduce(log_odds))
+    wrong = float(odds[2] + odds[3])
+    if wrong < MISSTATED:  # no likelier than that anything at all is wrong, before grips are seen
         return None
-    louder = EXPLANATIONS[4:] @ np.linalg.inv(covariance)
-    precision = GAIN_LOG_SD**-2 + (louder * EXPLANATIONS[4:]).sum(axis=1)
-    return ForceScale(odds, louder @ seen / precision, 1 / np.sqrt(precision))
+    prior = normal_prior(GAIN_LOG_SD)
+    of_g = [np.exp(prior + each - np.logaddexp.reduce(prior + each)) for each in (both, vertical)]
+    density = (odds[2] * of_g[0] + odds[3] * of_g[1]) / wrong
+    return ForceScale(wrong, density / density.sum())
 
 
 def _noise_excess(weighed: Sequence[WeighedTrial], rig: Rig) -> tuple[float, float] | None:
