@@ -29,6 +29,7 @@ LISTED = 0.05  # chosen: least probability of a place that is listed
 SURE = 1 - LISTED  # from here on one place is the answer: no other can be listed
 FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
 LEAST = 1e-3  # numerics: probability of a naming that makes no difference
+EXACT = 1e-6  # numerics: of a feature's spread: what is nearer to a level than that is at it
 
 
 @dataclass(frozen=True)
@@ -175,10 +176,7 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
             if crossing[here].sum() / crossing.sum() < MAIN:
                 dated[-1] = _boundary(data.edges, alignment.boundary[:, k - 1], first, last)[0]
     if model.courses and not any(course.shift[k - 1].any() for course in model.courses for k in kept[1:]):
-        ends = [first, *dated, last]
-        for b in range(1, len(ends) - 1):
-            ends[b] = _jump(trial, model, *ends[b - 1 : b + 2])
-        dated = ends[1:-1]
+        dated = _jumps(trial, data, model, dated)
     starts: list[_Boundary] = [(first, 0.0, (first, first))]
     elsewhere: list[tuple[Place, ...]] = [()]
     for number, (k, median, (_, sd, (low, high))) in enumerate(zip(kept[1:], dated, found, strict=True), 1):
@@ -193,35 +191,93 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
     )
 
 
-def _jump(trial: Trial, model: SequenceModel, before: float, time: float, after: float) -> float:
-    """When [s] the channels jump near the change `time` that the features give: the median.
+def _jumps(trial: Trial, data: SequenceFeatures, model: SequenceModel, times: list[float]) -> list[float]:
+    """When [s] the channels jump near the changes `times` that the features give.
 
-    Between two samples, NEAR at most and off that change by the law of `Weighing.lag`, or by cells. On either
-    side levels are constant with normal noise, as far as slopes look, or to the changes `before` and `after`
-    it [s].
+    Each is off the features' by the law of `Weighing.lag`, NEAR at most, and between them, as far as that
+    reaches, levels are constant with normal noise: all together on the cells, as changes that are near each
+    other share what they see, then each by itself between two samples.
     """
-    duration, step = trial.t[-1] - trial.t[0], model.mapping.step
-    farthest, lag = max(NEAR * duration, 1.5 * step), max(WEIGHING.lag * duration, step)
-    reach = farthest + model.mapping.window * step
+    step, cells = model.mapping.step, len(data.values)
+    farthest = max(round(NEAR * cells), 1)
+    reach, channels = farthest + model.mapping.window, len(model.mapping.channels)
+    at = np.clip(((np.array(times) - data.edges[0]) / step).astype(int), 1, cells - 2)
+    found: list[int] = []
+    for group in np.split(np.arange(at.size), np.flatnonzero(np.diff(at) > 2 * reach) + 1):
+        if group.size:
+            low = max(at[group[0]] - reach, found[-1] + 1 if found else 0)
+            high = min(at[group[-1]] + reach, *at[group[-1] + 1 :], cells)
+            x = data.values[low:high, :channels]
+            found += (low + _levels(x, at[group] - low, farthest, WEIGHING.lag * cells, model)).tolist()
+    middle = [float(data.edges[n] + step / 2) for n in found]
+    ends = [float(trial.t[0]), *middle, float(trial.t[-1])]
+    return [_jump(trial, model, *ends[b : b + 3]) for b in range(len(found))]
+
+
+def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: SequenceModel) -> np.ndarray:
+    """The cells, each within `farthest` of one of `at`, in which the level of `x` likeliest changes.
+
+    `x` (num_cells, num_channels). A cell in which it changes is of neither level.
+    """
+    there, x = _about_mean(x)
+    sums = [np.concatenate([np.zeros((1, x.shape[1])), v.cumsum(axis=0)]) for v in (there, x, x**2)]
+
+    def rest(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Squares that a level leaves from cell low + 1 up to high."""
+        count, first, second = (v[high] - v[np.minimum(low + 1, high)] for v in sums)
+        return second - first**2 / np.maximum(count, 1)
+
+    every = [np.arange(max(n - farthest, 1), min(n + farthest, len(x) - 2) + 1) for n in at]
+    if not all(each.size for each in every):
+        return at
+    found = at
+    for _ in range(2):  # noise is what the changes of before leave
+        ends = np.r_[-1, found, len(x)]
+        noise = rest(ends[:-1], ends[1:]).sum(axis=0) / np.maximum(sums[0][-1], 1) + EXACT**2
+        weight = model.emissions.temper / (2 * noise)
+        total, source = rest(np.full_like(every[0], -1), every[0]) @ weight, []
+        for b, each in enumerate(every):
+            if b:
+                low, high = np.meshgrid(every[b - 1], each, indexing="ij")
+                cost = np.where(high > low + 1, rest(low, high) @ weight, np.inf) + total[:, None]
+                source.append(cost.argmin(axis=0))
+                total = cost.min(axis=0)
+            total = total + np.abs(each - at[b]) / lag
+        if not np.isfinite(total).any():  # no room for all states
+            return at
+        path = [int((total + rest(every[-1], np.full_like(every[-1], len(x))) @ weight).argmin())]
+        for back in reversed(source):
+            path.append(int(back[path[-1]]))
+        found = np.array([each[n] for each, n in zip(every, path[::-1], strict=True)])
+    return found
+
+
+def _about_mean(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where values (n, k) are, and they about their means by column; 0 where they are missing."""
+    there = np.isfinite(x)
+    x = np.where(there, x, 0.0)
+    return there, np.where(there, x - x.sum(axis=0) / np.maximum(there.sum(axis=0), 1), 0.0)
+
+
+def _jump(trial: Trial, model: SequenceModel, before: float, time: float, after: float) -> float:
+    """The jump [s] within a cell of `time`, anywhere between two samples: the median."""
+    step = model.mapping.step
+    reach = model.mapping.window * step
     inside = slice(*np.searchsorted(trial.t, [max(before, time - reach), min(after, time + reach)]))
     x = np.stack([trial.channels[name][inside] for name in model.mapping.channels], axis=1)
     between = (trial.t[inside][1:] + trial.t[inside][:-1]) / 2
-    near = np.abs(between - time) <= farthest
-    if not near.any():
+    open_ = np.abs(between - time) <= 1.5 * step
+    if not open_.any():
         return time
-    there = np.isfinite(x)
-    count = there.cumsum(axis=0)
-    x = np.where(there, x, 0.0)
-    x = np.where(there, x - x.sum(axis=0) / np.maximum(count[-1], 1), 0.0)
-    first = x.cumsum(axis=0)
+    there, x = _about_mean(x)
+    count, first = there.cumsum(axis=0), x.cumsum(axis=0)
     left, right = count[:-1], count[-1] - count[:-1]
     explained = first[:-1] ** 2 / np.maximum(left, 1) + (first[-1] - first[:-1]) ** 2 / np.maximum(right, 1)
     total = (x**2).sum(axis=0)
     rest = np.maximum(total - explained, 1e-9 * total) + np.finfo(float).tiny
-    cost = model.emissions.temper * (count[-1] / 2 * np.log(rest)).sum(axis=1)
-    cost = (cost + np.abs(between - time) / lag)[near]
+    cost = model.emissions.temper * (count[-1] / 2 * np.log(rest)).sum(axis=1)[open_]
     weight = np.exp(cost.min() - cost).cumsum()
-    return float(between[near][np.searchsorted(weight, weight[-1] / 2)])
+    return float(between[open_][np.searchsorted(weight, weight[-1] / 2)])
 
 
 def _boundary(
