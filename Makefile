@@ -114,6 +114,7 @@ blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder
 
 sts3215: $(INSTALLED)  ## what changed of a servo, on labelled logs in the folder SET; fills docs/robots_results.md
 	$(BIN)/python -m experiments.real.sts3215 $(SET) --cases 4 --seed 4 --output experiments/results/sts3215.json
+	$(BIN)/python -m experiments.real.bam $(SET) --output experiments/results/sts3215_bam.json
 	$(BIN)/python -m experiments.write_tables
 
 REAL := $(or $(RECORDINGS),../shared/real)

@@ -78,6 +78,24 @@ def changed() -> str | None:
     return f"{markdown(['', 'of', 'share', 'goal'], rows)}\n\n{note}"
 
 
+def bam() -> str | None:
+    """Whole logs of what was left out, of three models."""
+    found = load("sts3215_bam")
+    if found is None:
+        return None
+    rows = []
+    for by, words in (("kp", "one gain of three"), ("mass", "one mass of two")):
+        one = found.get(by, {"compared": []})
+        for pair in one["compared"]:
+            low, high = (1e3 * v for v in pair["interval_95"])
+            ours, other = (1e3 * one["rms"][pair[n]] for n in ("one", "other"))
+            less = f"{1e3 * pair['less']:.1f} ({low:.1f} to {high:.1f})"
+            rows.append([words, pair["other"], f"{ours:.1f}", f"{other:.1f}", less])
+    head = ["left out in turn", "rival", "ours [mrad]", "rival [mrad]", "difference"]
+    note = f"In brackets 95 % intervals by a paired bootstrap. Code of {found['made_by']}."
+    return f"{markdown(head, rows)}\n\n{note}"
+
+
 def given() -> str | None:
     """Faulty robots of another generator, case by case."""
     found = load("robots_check_given")

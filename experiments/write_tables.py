@@ -54,6 +54,7 @@ TABLES: tuple[tuple[str, str, Callable[[], str | None], str], ...] = (
     ("docs/robots_results.md", "robots_check_given", table_robots.given, "robots-given"),
     ("docs/robots_results.md", "robots_check", table_robots.check, "robots-check"),
     ("docs/robots_results.md", "sts3215", table_robots.changed, "sts3215"),
+    ("docs/robots_results.md", "sts3215_bam", table_robots.bam, "sts3215"),
     ("docs/wrist.md", "wrist", wrist.wrist, "wrist"),
     ("docs/tables/wrist.csv", "", partial(wrist.wrist, every=True), "wrist"),
     ("docs/sequences.md", "sequences", sequences.table, "sequences"),

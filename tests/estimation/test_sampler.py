@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from estimation_scene import UNIT, drawn, make_design
 
-from estimation import priors
+from estimation import priors, sampler
 from estimation.posterior import find_mode, posterior
 from estimation.sampler import GROUPS, MIN_ESS, effective_sample_size, proposal, sample, split_rhat
 
@@ -102,6 +102,14 @@ def test_draws_that_only_the_prior_decides_do_not_pass_as_converged():
     assert "R-hat" not in hardly.shortfall and "effective sample size" not in hardly.shortfall
     assert never.impossible == (0,) and never.flat[:, 0].mean() == pytest.approx(-2.0, abs=0.1)
     assert never.converged and (never.flat[:, 1:] > 0).all()
+
+
+def test_systematic_resampling_keeps_the_weights():
+    weight = np.random.default_rng(0).dirichlet(np.ones(50))
+    big = np.concatenate([np.repeat(weight / 200, 200)])
+    index = sampler._resampled(big, np.random.RandomState(0))
+    np.testing.assert_allclose(np.bincount(index // 200, minlength=50) / big.size, weight, atol=1.1 / 10_000)
+    assert (np.diff(index) >= 0).all()
 
 
 def test_the_same_seed_draws_the_same(post, draws):

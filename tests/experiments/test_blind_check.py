@@ -12,7 +12,7 @@ mujoco = pytest.importorskip("mujoco", reason="the blind check's simulator needs
 from experiments.blind_check import cases as sets  # noqa: E402
 from experiments.blind_check.effects import CATALOGUE  # noqa: E402
 from experiments.blind_check.generate import NOMINAL, generate  # noqa: E402
-from experiments.blind_check.hand import load_rig  # noqa: E402
+from experiments.blind_check.hand import angles, load_rig, rates, tips  # noqa: E402
 from experiments.blind_check.operator import Style, plan  # noqa: E402
 from experiments.blind_check.perform import SETTLE, perform  # noqa: E402
 from experiments.blind_check.scene import PIVOT, STEP, Block, Servo, World, mjcf  # noqa: E402
@@ -112,6 +112,15 @@ def test_pads_touch_no_block_but_the_one_that_is_moved(monkeypatch):
     assert {name for name, n in touched if n * STEP > amid} == {"box_block2"}
 
 
+def test_angles_and_tips_are_inverse(motion):
+    q = angles(RIG, motion.position)
+    np.testing.assert_allclose(tips(RIG, q), motion.position, atol=1e-12)
+    turned = np.gradient(q, motion.t, axis=0)[100:-100]
+    np.testing.assert_allclose(rates(RIG, q, motion.velocity)[100:-100], turned, atol=0.04)
+    longer = angles(RIG, motion.position, 0.02)
+    assert np.abs(tips(RIG, longer) - motion.position).max() > 1e-3
+
+
 def test_noise_has_the_rigs_size(motion):
     signals = sense(motion, RIG, [], np.random.default_rng(0))
     _, noisy = sample(signals, Sampling(), np.random.default_rng(1))
@@ -203,6 +212,13 @@ def test_a_finger_may_close_first_and_the_truth_is_of_the_grip():
         assert both[touch + 1] and not both[: touch - 1].any()
     pushed = lambda m: abs(m.centres[np.searchsorted(m.t, m.boundaries[0]), 0, 0] - m.centres[0, 0, 0])  # noqa: E731
     assert pushed(together) < 3e-4 < 8e-4 < pushed(apart)
+
+
+def test_sets_are_drawn_alike_and_keep_their_shares():
+    assert sets.draw_cases(30, 3, RIG) == sets.draw_cases(30, 3, RIG)
+    assert sets.draw_cases(30, 3, RIG) != sets.draw_cases(30, 4, RIG)
+    drawn = [c.tier for c in sets.draw_cases(sum(sets.TIERS.values()), 3, RIG)]
+    assert {t: drawn.count(t) for t in sets.TIERS} == sets.TIERS
 
 
 def test_a_seal_is_kept_and_a_changed_label_is_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -1,6 +1,7 @@
 """Scores against hand-made truths, and the reading of a case."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from experiments.scoring import (
     boundary_residuals,
     property_scores,
     state_accuracy,
+    summarise_boundaries,
     summarise_properties,
 )
 from hmmseg.contact.decompose import subtasks
@@ -40,6 +42,12 @@ def test_boundaries_against_truth():
     missing = make([1.0, 2.0], 3)
     assert np.isnan(boundary_residuals(missing, TRUTH)).all()
     assert np.isnan(boundaries_covered(missing, TRUTH)).all()
+
+
+def test_summary_of_boundaries_leaves_out_what_is_missing():
+    summary = summarise_boundaries(np.array([-0.1, 0.3, math.nan]), np.array([1.0, 0.0, math.nan]))
+    assert summary == pytest.approx({"median": 0.2, "percentile_95": 0.29, "coverage_90": 0.5})
+    assert summarise_boundaries(np.array([math.nan]), np.array([math.nan]))["median"] is None
 
 
 def test_state_accuracy_counts_samples():

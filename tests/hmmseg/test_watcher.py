@@ -1,6 +1,8 @@
 """A task followed while it runs: the same physics as off line, nothing looked ahead, nothing lost."""
 
+import io
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,7 @@ from hmmseg.online.watcher import Watcher
 from hmmseg.online.wrist import Opening
 from hmmseg.segmentation.align import align, segment
 from hmmseg.segmentation.emissions import STILL, Parameters, _log_halting, features, log_likelihoods
+from hmmseg_cli.main import main
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 CASE = RECORDINGS / "paper_blocks"
@@ -363,3 +366,25 @@ def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
     assert not final["fits"]
     first = next(line["t"] for line in lines if not line["fits"])
     assert 4.36 < first < 4.86
+
+
+def test_the_command_follows_a_wrist(performed, monkeypatch, capsys, tmp_path):
+    _, columns = performed
+    (tmp_path / "task.toml").write_text(
+        '[objects.a]\non = "b"\n[objects.b]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n'
+        '[[moves]]\nobject = "b"\nto = "a"\n'
+    )
+    (tmp_path / "rig.toml").write_text(
+        '[gripper]\nposition = ["px", "py", "pz"]\nopening = "gap"\nwrench = ["Fx", "Fy", "Fz"]\n'
+        "[fingertip]\nnormal_stiffness = 4000.0\nshear_stiffness = 2500.0\n"
+    )
+    rows = [
+        ",".join(columns),
+        *(",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True)),
+    ]
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("\n".join(rows).encode() + b"\n")))
+    code = main(["watch", "--task", str(tmp_path / "task.toml"), "--rig", str(tmp_path / "rig.toml")])
+    out, err = capsys.readouterr()
+    assert code == 0 and err == ""
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert len(lines) == len(rows) and lines[-1]["fits"]

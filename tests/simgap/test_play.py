@@ -27,7 +27,7 @@ from hmmseg_cli.main import main
 from hmmseg_cli.play import diagnosed
 from simgap.play.server import PlayServer
 from simgap.play.session import Session, default_rig, default_task
-from simgap.play.world import effect_values, scene_with
+from simgap.play.world import effect_values, felt_effects, scene_with, sensed
 from simgap.world.properties import PAPER_BLOCKS
 
 
@@ -130,6 +130,16 @@ def test_an_effect_has_the_parameters_of_one_form_alone():
     assert gain.keys() == {"gain"}
     one = {key: value for key, value in effect_values("force_gain", {"fx1": 0.1}).items() if value}
     assert one == {"fx1": 0.1}
+
+
+@pytest.mark.parametrize("name", sorted(felt_effects()))
+def test_every_offered_effect_can_be_felt(name):
+    t = np.arange(400) * 1e-3
+    force = np.ones((400, 2, 2)) * np.linspace(0, 2, 400)[:, None, None]
+    place = np.zeros((400, 2, 2))
+    out = sensed({name: effect_values(name)}, t, place, place, force, default_rig())
+    assert out.shape == force.shape
+    assert np.isfinite(out).all()
 
 
 def test_a_diagnosis_names_what_stands_beside(tmp_path):
