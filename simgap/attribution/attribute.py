@@ -183,7 +183,7 @@ def attribute(
     by_group = (noise**2)[channel_of(f)]
     ranked, others = [m.effects for m in models if m.effects][:EXAMINED], None
     if heldout and (found.p_value < ALARM or forced):
-        others = Heldout.of(gap, noise**2, (j for effects in ranked for j in effects))
+        others = Heldout.of(f, noise**2, (j for effects in ranked for j in effects))
     examined = {effects: _examined(f, effects, models, by_group, rng, others) for effects in ranked}
     sets = [_explanation(f, m.effects, float(x), examined) for m, x in zip(models, w, strict=True)]
     small = None

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.stats import t as student
 
 from simgap.attribution.posterior import Forms, Model, channel_of, coordinates, fitted, forms, quadratic_forms
-from simgap.attribution.problem import Gap
 from simgap.bounded import least
 
 # An effect whose parameters differ from part to part of recordings is known less well than noise alone says.
@@ -138,28 +137,26 @@ class HowFar:
 class Heldout:
     """Every trial predicted by the others; `noise` (channels,): variance of each channel's noise.
 
-    `among`: the gap's candidates that sets are made of; `whole`: all trials, `folds`: the others and the
-    trial, of these candidates alone; `evidence` [nats] of all candidates, besides their rows; `computed`:
-    squares (K + 1,) and log determinants (K + 1,) of sets so far.
+    `whole`: all trials together; `among`: its candidates that sets are made of; `folds`: the others and the
+    trial, of these alone; `computed`: squares (K + 1,) and log determinants (K + 1,) of sets so far.
     """
 
     noise: np.ndarray
-    among: tuple[int, ...]
     whole: Forms
+    among: tuple[int, ...]
     folds: tuple[tuple[Forms, Forms], ...]
-    evidence: tuple[float, ...]
     computed: dict[tuple[tuple[int, ...], ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, gap: Gap, noise: np.ndarray, among: Iterable[int]) -> Heldout | None:
+    def of(cls, whole: Forms, noise: np.ndarray, among: Iterable[int]) -> Heldout | None:
         """None with one trial: nothing predicts it."""
-        trials = np.unique(gap.rows.trial)
+        trials = np.unique(whole.gap.rows.trial)
         if trials.size < 2:
             return None
         among = tuple(sorted(set(among)))
-        few, inside = gap.only(among), [gap.rows.trial == trial for trial in trials]
+        few, inside = whole.gap.only(among), [whole.gap.rows.trial == trial for trial in trials]
         folds = tuple((forms(few.taken(~one)), forms(few.taken(one))) for one in inside)
-        return cls(noise, among, forms(few), folds, tuple(c.evidence for c in gap.candidates))
+        return cls(noise, whole, among, folds)
 
     def how_far(self, effects: Sequence[int]) -> HowFar | None:
         """How far a set of effects shrinks the gap; None where these trials have no excess of squares."""
@@ -180,14 +177,15 @@ class Heldout:
         """The same of every trial, and of what was measured apart (K + 1,), with what else speaks for a set;
         forms of effects that may be `off` are no better than they usually are."""
         (more, wide), (less, plain) = self._squares(effects, off), self._squares(without, off)
-        known = sum(self.evidence[j] for j in effects) - sum(self.evidence[j] for j in without)
+        of = self.whole.gap.candidates
+        known = sum(of[j].evidence for j in effects) - sum(of[j].evidence for j in without)
         gained = 0.5 * (less + plain - more - wide)
         return gained + known / len(self.folds) * (np.arange(gained.size) < len(self.folds))
 
     def _squares(self, effects: Sequence[int], off: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
         key, loose = (tuple(sorted(self.among.index(j) for j in which)) for which in (effects, off))
         if (key, loose) not in self.computed:
-            x = fitted(self.whole, key).x[: self.whole.spectrum.num_nuisances]
+            x = fitted(self.whole, tuple(sorted(effects))).x[: self.whole.spectrum.num_nuisances]
             each = [self._predicted(train, test, key, loose) for train, test in self.folds]
             each = np.array([*each, (float(x @ x), 0.0)])
             self.computed[key, loose] = each[:, 0], each[:, 1]

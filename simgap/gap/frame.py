@@ -290,10 +290,10 @@ def _opening(signals: Signals, force: np.ndarray, free: np.ndarray) -> np.ndarra
     the pads' stiffness.
     """
     out, distance, squeeze = np.zeros(free.size, bool), signals.x2 - signals.x1, force[:, 0] - force[:, 2]
-    ends = np.flatnonzero(free[1:] & ~free[:-1]) + 1
-    for start, end in zip(np.flatnonzero(~free & np.roll(free, 1)), ends, strict=False):
+    for end in np.flatnonzero(free[1:] & ~free[:-1]) + 1:
+        start = 1 + int(np.flatnonzero(free[:end]).max(initial=-1))
         grip = np.arange(start, end)[np.isfinite(distance[start:end])]
-        if np.ptp(squeeze[grip]) == 0:
+        if np.unique(squeeze[grip]).size < 2:
             continue
         unloaded = np.polyfit(squeeze[grip], distance[grip], 1)[1]
         nearer = (distance[end:] < unloaded) & free[end:]

@@ -273,7 +273,7 @@ def test_a_noise_stated_too_low_is_no_gap():
 
 def test_how_far_covers_what_was_planted():
     gap = gap_of({0: 4.0}, seed=4)
-    held = Heldout.of(gap, np.ones(3), (0, 1))
+    held = Heldout.of(forms(gap), np.ones(3), (0, 1))
     assert held is not None
     far = held.how_far((0,))
     push = gap.candidates[0].jacobian[:, 0] * 4.0
@@ -285,7 +285,7 @@ def test_how_far_covers_what_was_planted():
 def test_a_trial_is_predicted_with_all_that_the_others_leave_open():
     """Against the dense covariance of a trial's rows, all else as the others have it."""
     gap = gap_of({0: 2.0, 1: -1.0}, seed=2)
-    held = Heldout.of(gap, np.array([1.0, 1.3, 0.8]), (0, 1))
+    held = Heldout.of(forms(gap), np.array([1.0, 1.3, 0.8]), (0, 1))
     assert held is not None
     for effects in ((), (0,), (0, 1)):
         squares = held._squares(effects)[0]
@@ -304,7 +304,7 @@ def test_what_is_of_one_trial_takes_nothing_off_the_held_out_share():
     of_trial = np.eye(4)[gap.rows.trial] * (gap.rows.channel == 1)[:, None]
     rough = replace(gap, residual=gap.residual + of_trial @ [1.5, -2.0, 1.0, -1.0],
                     nuisance=np.concatenate([gap.nuisance, of_trial], 1))  # fmt: skip
-    found = [Heldout.of(g, np.ones(3), (0,)) for g in (gap, rough)]
+    found = [Heldout.of(forms(g), np.ones(3), (0,)) for g in (gap, rough)]
     plain, mixed = (h.how_far((0,)) for h in found if h is not None)
     assert plain is not None and mixed is not None
     assert mixed.fraction == pytest.approx(plain.fraction, abs=0.05)
@@ -312,7 +312,7 @@ def test_what_is_of_one_trial_takes_nothing_off_the_held_out_share():
 
 def test_causes_are_those_without_which_other_trials_are_predicted_worse():
     gap = gap_of({0: 4.0, 2: 3.0}, seed=4)
-    held = Heldout.of(gap, np.ones(3), range(4))
+    held = Heldout.of(forms(gap), np.ones(3), range(4))
     assert held is not None
     assert _predicting(held, (0, 1, 2, 3)) == (0, 2)
     assert held.gain((0, 2), (0,)) > 3 > held.gain((0, 1, 2), (0, 2))
@@ -324,7 +324,7 @@ def test_what_one_trial_alone_says_is_an_accident():
     push, own = gap.candidates[2].jacobian[:, 0], gap.rows.trial == 1
     for where, causes in ((own, (0,)), (np.ones_like(own), (0, 2))):
         more = 6.0 * push * where
-        held = Heldout.of(replace(gap, residual=gap.residual + more), np.ones(3), range(4))
+        held = Heldout.of(forms(replace(gap, residual=gap.residual + more)), np.ones(3), range(4))
         assert held is not None and held.gain((0, 2), (0,)) > 3
         assert _predicting(held, (0, 2)) == causes
 
@@ -353,7 +353,7 @@ def test_a_cause_that_leaves_nothing_that_can_be_seen_is_known_however_little_it
     rest = 9.0 * np.sin(gap.rows.time * 40.0 + gap.rows.trial) * (gap.rows.channel == 2)
     for more, likely in ((0.0, True), (rest, False)):
         f, rng = forms(replace(gap, residual=gap.residual + more)), np.random.default_rng(0)
-        others = Heldout.of(f.gap, np.full(3, 9.0), (0,))
+        others = Heldout.of(f, np.full(3, 9.0), (0,))
         found = _examined(f, (0,), sought(f), np.full(f.count.size, 9.0), rng, others)
         assert found.causes == (0,)
         assert (found.known > 0.5) == likely
