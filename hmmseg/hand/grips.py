@@ -61,9 +61,8 @@ class Closings:
         return True
 
 
-Closing = tuple[
-    int, int, int | None
-]  # samples: where it begins and is least, and where it is open again, if so
+# Samples: where it begins and is least, and where it is open again, if so.
+Closing = tuple[int, int, int | None]
 
 
 def closings(opening: np.ndarray) -> list[Closing]:

@@ -6,6 +6,7 @@ each reading, and an empty call with the table of hypotheses takes about as long
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import pickle
@@ -14,12 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import IndexDataCacheFile
 from numba.extending import overload
 
 from hmmseg import densities, levels
 from hmmseg.cache import cache_folder, keep, kept
 from hmmseg.contact import equations
+
+try:
+    from numba.core.caching import IndexDataCacheFile
+except ImportError:  # another numba than those that this was tried with keeps its files itself
+    IndexDataCacheFile: Any = object
 
 HOME, SHARED = cache_folder(), (densities, levels, equations)
 if HOME is not None and not numba.config.CACHE_DIR:  # type: ignore[attr-defined]
@@ -60,7 +65,8 @@ def compiled(function: Callable) -> Any:
     function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
     made: Any = numba.njit(function, cache=CACHED, **OPTIONS)
     if CACHED:
-        made._cache._cache_file.__class__ = _Kept
+        with contextlib.suppress(AttributeError, TypeError):
+            made._cache._cache_file.__class__ = _Kept
     return made
 
 
