@@ -31,17 +31,11 @@ STAGES = 14  # look: stages that a progress bar counts at most
 class RobotDiagnosis:
     """All that was found.
 
-    Attributes:
-        composed: The model along the windows that were compared.
-        phases: Stretches of the logs by name.
-        search: All sets that were fitted.
-        best: The best of them.
-        verdict: The verdict.
-        shrinkage: Of the gap on held-out logs; None without causes.
-        identifiable: Which candidates' parameters the logs tell apart.
-        next_log: The next experiment.
-        calibrated: The model with what nobody measured fitted, where there is such.
-        warnings: One line each.
+    `composed`: the model along the windows that were compared; `phases`: stretches of the logs by name;
+    `search`: all sets that were fitted; `best`: the best of them; `verdict`: the verdict; `shrinkage`: of the
+    gap on held-out logs; None without causes; `identifiable`: which candidates' parameters the logs tell
+    apart; `next_log`: the next experiment; `calibrated`: the model with what nobody measured fitted, where
+    there is such; `warnings`: one line each.
     """
 
     composed: Composed

@@ -37,15 +37,10 @@ class Moved:
 class Linear:
     """The gap linearised about a point.
 
-    Attributes:
-        point: The point.
-        rows: The rows that are compared.
-        residual: Recorded less simulated values (N,); NaN where a rollout diverged.
-        starts: Derivatives (N,) of the rows by each state of their window's start.
-        moved: How effects move the rows.
-        diverged: Effects whose rollouts diverged.
-        dropped: Number of windows whose rollout diverged.
-        rates: Rates (N,) of the simulated channels.
+    `point`: the point; `rows`: the rows that are compared; `residual`: recorded less simulated values (N,);
+    NaN where a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's
+    start; `moved`: how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number
+    of windows whose rollout diverged; `rates`: rates (N,) of the simulated channels.
     """
 
     point: Point

@@ -29,18 +29,12 @@ class Composed:
     parameters: they are taken once, at the point `about`, and what would cost a second run (a finer step) is
     linear in its parameter.
 
-    Attributes:
-        simulator: The robot's model.
-        recordings: Its logs.
-        windows: Stretches of the logs, each simulated from its own start.
-        effects: Candidates and what is fitted along, by name.
-        noise: Standard deviation of one sample by channel [its unit].
-        rows: The rows that the windows give.
-        wobble: Change (N, K) of the rows by a usual size of every effect, in windows in which bodies move in
-            contact; None without such windows.
-        motion: A number for every log's motion, equal in repeats (see `motions`); empty where windows restart
-            from states of their own.
-        about: The point of those derivatives.
+    `simulator`: the robot's model; `recordings`: its logs; `windows`: stretches of the logs, each simulated
+    from its own start; `effects`: candidates and what is fitted along, by name; `noise`: standard deviation
+    of one sample by channel [its unit]; `rows`: the rows that the windows give; `wobble`: change (N, K) of
+    the rows by a usual size of every effect, in windows in which bodies move in contact; None without such
+    windows; `motion`: A number for every log's motion, equal in repeats (see `motions`); empty where windows
+    restart from states of their own; `about`: the point of those derivatives.
     """
 
     simulator: Simulator

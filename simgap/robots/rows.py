@@ -25,14 +25,10 @@ RATE_LIMIT = 100.0  # chosen: Hz: samples are averaged down to this rate
 class Rows:
     """N rows, ordered by window, then time, then channel.
 
-    Attributes:
-        channels: Names of the compared channels.
-        log, channel, window, regime: Number (N,) of each row's log, channel, window and window's regime.
-        time: Times (N,) [s].
-        since: Times (N,) [s] since the window's first sample.
-        observed: Recorded values (N,) in the channel's unit.
-        variance: Variance (N,) of their sensor noise.
-        of: The rows of each window.
+    `channels`: names of the compared channels; `log`, `channel`, `window`, `regime`: number (N,) of each
+    row's log, channel, window and window's regime; `time`: times (N,) [s]; `since`: times (N,) [s] since the
+    window's first sample; `observed`: recorded values (N,) in the channel's unit; `variance`: variance (N,)
+    of their sensor noise; `of`: the rows of each window.
     """
 
     channels: tuple[str, ...]

@@ -61,18 +61,12 @@ MANY = 80  # numerics: candidates up to which all pairs are tried
 class Settled:
     """A set of effects at its best fit.
 
-    Attributes:
-        composed: The model, with the derivatives by the simulator's own numbers taken at the fit.
-        names: The set.
-        point: Its parameters, and those of what is fitted along.
-        linear: The gap linearised about the point, in the set's effects.
-        covariances: Of the rows.
-        discrepancy: What the set leaves beyond noise.
-        wide: Windows that are off for reasons of their own, with the factor of their variance.
-        whiten: By noise, discrepancy and wide windows.
-        sets: The closed form about the point.
-        score: Log evidence [nats].
-        promise: Log evidence [nats] that the closed form expects of a further step.
+    `composed`: the model, with the derivatives by the simulator's own numbers taken at the fit; `names`: the
+    set; `point`: its parameters, and those of what is fitted along; `linear`: the gap linearised about the
+    point, in the set's effects; `covariances`: of the rows; `discrepancy`: what the set leaves beyond noise;
+    `wide`: windows that are off for reasons of their own, with the factor of their variance; `whiten`: by
+    noise, discrepancy and wide windows; `sets`: the closed form about the point; `score`: log evidence
+    [nats]; `promise`: log evidence [nats] that the closed form expects of a further step.
     """
 
     composed: Composed
@@ -107,17 +101,12 @@ class Settled:
 class Search:
     """A search over sets of candidates.
 
-    Attributes:
-        composed: The model along the windows that are compared.
-        wanted: Names of the candidates.
-        fold: Fold (N,) of each row.
-        calibrated: Fits what nobody measured, from the model as it comes; called where a gap is left.
-        calibration: Its result.
-        known: All sets that were fitted, each at its best.
-        against: Joint candidates (see `_together`): how much of the second goes against one of the first.
-        columns: Candidates as they were rolled out where the search began; None of one that diverged.
-        identifiable: Which candidates' parameters the logs tell apart.
-        diverged: Candidates that diverge.
+    `composed`: the model along the windows that are compared; `wanted`: names of the candidates; `fold`: fold
+    (N,) of each row; `calibrated`: fits what nobody measured, from the model as it comes; called where a gap
+    is left; `calibration`: its result; `known`: all sets that were fitted, each at its best; `against`: joint
+    candidates (see `_together`): how much of the second goes against one of the first; `columns`: candidates
+    as they were rolled out where the search began; None of one that diverged; `identifiable`: which
+    candidates' parameters the logs tell apart; `diverged`: candidates that diverge.
     """
 
     composed: Composed

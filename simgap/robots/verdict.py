@@ -47,12 +47,10 @@ PART = 0.1  # chosen: that share of the gap
 class Shrinkage:
     """How far the gap shrinks on held-out stretches of the logs.
 
-    Attributes:
-        before, after, noise_floor: Mean squares of whitened residuals, and those of noise alone.
-        fraction, interval_90: The share of the gap that is gone, and its 90 % interval by fold.
-        rms: Root mean squares before and after by channel, in its unit.
-        plain, residual: Residuals (N,) before and after; NaN where unknown.
-        squares: Their whitened squares (2, N); NaN where one is unknown.
+    `before`, `after`, `noise_floor`: mean squares of whitened residuals, and those of noise alone;
+    `fraction`, `interval_90`: the share of the gap that is gone, and its 90 % interval by fold; `rms`: root
+    mean squares before and after by channel, in its unit; `plain`, `residual`: residuals (N,) before and
+    after; NaN where unknown; `squares`: their whitened squares (2, N); NaN where one is unknown.
     """
 
     before: float
@@ -111,16 +109,11 @@ def _fitted(part: Composed, one: Settled, point: Point, only: Sequence[str] | No
 class RobotVerdict(Verdict):
     """The verdict and what it rests on.
 
-    Attributes:
-        detection: Of the gap.
-        remainder: What the causes leave.
-        where: Where the gap is.
-        shares: Shares of the whole gap by effect of `shared`.
-        chance: Probability of each candidate to act.
-        over_noise: Root mean square of what is left, over the noise's.
-        stands_in: To each cause the effects that the logs do not tell from it.
-        doubts: Why an explanation that leaves little is not believed.
-        explanation: The best set, known or not.
+    `detection`: of the gap; `remainder`: what the causes leave; `where`: where the gap is; `shares`: shares
+    of the whole gap by effect of `shared`; `chance`: probability of each candidate to act; `over_noise`: root
+    mean square of what is left, over the noise's; `stands_in`: to each cause the effects that the logs do not
+    tell from it; `doubts`: why an explanation that leaves little is not believed; `explanation`: the best
+    set, known or not.
     """
 
     detection: Detection
