@@ -19,7 +19,7 @@ from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects import LACKING
 from simgap.robot_effects.base import NORMAL_90, RobotEffect, entry
-from simgap.robots.fit import FINEST, Whiten, moved_to
+from simgap.robots.fit import FINEST, Whiten, fit_effects
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import folds_of, noises
@@ -58,7 +58,7 @@ class Calibration:
     after: Mapping[str, float]
 
     @property
-    def told(self) -> np.ndarray:
+    def determined(self) -> np.ndarray:
         """Whether the logs determine each parameter by itself (p,)."""
         return np.sqrt(np.diag(self._posterior)) <= UNTOLD
 
@@ -72,7 +72,7 @@ class Calibration:
         held-out logs."""
         every = range(len(self.names))
         own = [k for k in every if not self.composed.effects[self.names[k][0]].numeric]
-        untold = [k for k in own if not self.told[k]]
+        untold = [k for k in own if not self.determined[k]]
         return {
             "parameters": {self.label(k): self.entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
             "reasons": {self.label(k): self._reason(k) for k in untold},
@@ -120,13 +120,13 @@ class Calibration:
     def combinations(self) -> list[dict[str, Any]]:
         """Weighted sums that the logs determine of jointly determined parameters, each with a pivot of its
         own."""
-        left, out = [int(k) for k in np.flatnonzero(~self.told & (np.diag(self.information) >= 1))], []
+        left, out = [int(k) for k in np.flatnonzero(~self.determined & (np.diag(self.information) >= 1))], []
         while left:
             group = np.array(self._group(left[0]))
             left = [k for k in left if k not in group]
             value, vector = np.linalg.eigh(self._posterior[np.ix_(group, group)])
             rows = vector[:, np.sqrt(value) <= UNTOLD].T / self.sd[group]
-            for row in _reduced(rows, self.sd[group]):
+            for row in _echelon(rows, self.sd[group]):
                 whole = np.zeros(len(self.names))
                 whole[group] = row
                 mean = sum(c * self.value(k) for k, c in enumerate(whole) if c)
@@ -142,7 +142,7 @@ class Calibration:
 _UNKNOWN = {"mean": None, "sd": None, "interval_90": None}
 
 
-def _reduced(rows: np.ndarray, size: np.ndarray) -> list[np.ndarray]:
+def _echelon(rows: np.ndarray, size: np.ndarray) -> list[np.ndarray]:
     """Rows (k, g) in reduced echelon form: each has a pivot 1 in a column where the others have 0.
 
     Entries that matter little at the parameters' sizes (g,) become 0.
@@ -196,7 +196,7 @@ def calibrate(
     if begin is None:
         linear = linearise(windows, point, [])
         whiten = covariances(windows, linear).whitener()
-        near, steps = moved_to(windows, linear, whiten, point, stated, STEPS), STEPS
+        near, steps = fit_effects(windows, linear, whiten, point, stated, STEPS), STEPS
     tell("whole logs")
     whole = Composed.of(simulator, _stretches(recordings), mine, noise, LONGEST)
     start = min((near, point), key=lambda p: _cost(whole, p))
@@ -207,7 +207,7 @@ def calibrate(
         found, linear, whiten = _least_squares(whole.moved(found), found, STEPS, fitted)
         stated = fitted
     tell("what the logs determine")
-    names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten, stated)
+    names, sd, information, covariance = _sensitivities(whole.moved(found), found, linear, whiten, stated)
     tell("held-out logs")
     before, after = _held_out(whole.moved(found), found, stated) if judged else ({}, {})
     return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
@@ -230,11 +230,11 @@ def _scales(composed: Composed, residual: np.ndarray) -> np.ndarray:
         mine = rows.channel == c
         parts = [residual[mine & (rows.window == w)] for w in np.unique(rows.window[mine])]
         seen = [np.nan_to_num(part) for part in parts if part.size]
-        out[mine] = np.sqrt(np.mean(np.concatenate(seen) ** 2) * _repeated(seen)) if seen else 0.0
+        out[mine] = np.sqrt(np.mean(np.concatenate(seen) ** 2) * _repeats(seen)) if seen else 0.0
     return np.maximum(out, np.sqrt(rows.variance))
 
 
-def _repeated(parts: Sequence[np.ndarray]) -> float:
+def _repeats(parts: Sequence[np.ndarray]) -> float:
     """How many neighbouring rows repeat each other: 1 + 2 (rho_1 + rho_2 + ..), up to the first
     autocorrelation that is none (Geyer, Statistical Science 7, 1992)."""
     total, out = sum(float(p @ p) for p in parts), 1.0
@@ -304,12 +304,12 @@ def _least_squares(
     """
     linear = linearise(composed, point, [])
     for _ in range(ROUNDS if steps == STEPS else 1):
-        point = moved_to(composed, linear, _whitener(composed, linear), point, free, steps)
+        point = fit_effects(composed, linear, _whitener(composed, linear), point, free, steps)
         linear = linearise(composed, point, [], linear.starts)
     return point, linear, _whitener(composed, linear)
 
 
-def _told(
+def _sensitivities(
     composed: Composed, point: Point, linear: Linear, whiten: Whiten, free: Sequence[str]
 ) -> tuple[tuple[tuple[str, str], ...], np.ndarray, np.ndarray, np.ndarray]:
     """What the logs tell of the free effects' parameters.

@@ -44,7 +44,7 @@ from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
-from simgap.robots.fit import Local, descended
+from simgap.robots.fit import Local, minimise
 from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import noises
@@ -55,8 +55,8 @@ from simgap.robots.unchanged import (
     Coordinates,
     Old,
     Runs,
-    halved,
-    learned,
+    best_of_halves,
+    fit_old,
     loss,
     units_of,
     without_broken,
@@ -170,24 +170,24 @@ class Comparison:
         bend[:p, :p] = old.bend
         begun = [np.concatenate([np.zeros(p), x]) for x in starts]
         for wider in (WIDER, 1.0):
-            runs.scaled(wider * old.scale)
+            runs.set_scales(wider * old.scale)
             z = min(begun, key=of.cost)
             theta = of.columns(z)
             theta[:, p:] = 0.0
 
             def local(z: np.ndarray, theta=theta) -> Local:  # theta moves little, and its columns less
-                information, pull = runs.told(runs.rows(of.point(z)), theta + of.columns(z, effects))
+                information, pull = runs.information(runs.rows(of.point(z)), theta + of.columns(z, effects))
                 return information.sum(0) + bend, pull.sum(0) - bend @ z
 
-            z = descended(of.cost, local, z, far=FAR)
+            z = minimise(of.cost, local, z, far=FAR)
             begun = [z]
-        information, pull = runs.told(runs.rows(of.point(z)), of.columns(z))
+        information, pull = runs.information(runs.rows(of.point(z)), of.columns(z))
         total, rest = information.sum(0) + bend, pull.sum(0) - bend @ z
         left = np.zeros(len(runs.units))
         moved = [np.zeros((n, k)) for n in map(len, (runs.units, old.units))]
         for u in range(left.size):
             step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
-            there = halved(lambda z, u=u: of.cost(z, u), z, step)
+            there = best_of_halves(lambda z, u=u: of.cost(z, u), z, step)
             left[u], moved[0][u] = runs.losses(of.point(there), u)[1], (there - z)[p:]
         for u in range(len(old.units)):
             less, push = total.copy(), rest.copy()
@@ -212,7 +212,7 @@ class Comparison:
         out, known, first = {}, () if about is None else about.effects, np.zeros(len(self.old.theta.names))
         if about is not None:
             first = np.concatenate([about.theta, about.x])
-        self.runs.scaled(WIDER * self.old.scale)
+        self.runs.set_scales(WIDER * self.old.scale)
         for name in (n for n in self.candidates if n not in known):
             of = Hypothesis.about(self.runs, self.old, (*known, name))
             k = len(self.old.theta.names) + of.mine.size - first.size
@@ -513,7 +513,7 @@ def changes(
     units = units_of(before, composed)
     if known is None or not np.array_equal(known.units, np.unique(units[0])):
         tell("how far the old logs differ")
-        known = learned(before, calibration, units[0])
+        known = fit_old(before, calibration, units[0])
     tell("changes in the new logs")
     found = Comparison(composed, known, candidates, units[1])
     return _concluded(found.searched(), found, (*broken, *more), calibration)

@@ -9,7 +9,7 @@ import numpy as np
 from simgap.attribution.verdict import entries, rows
 from simgap.robot_effects.base import entry
 from simgap.robots.diagnose import RobotDiagnosis
-from simgap.robots.search import Settled
+from simgap.robots.search import FittedSet
 
 SEEN = 3.0  # chosen: standard deviations of the noise's squares; a phase with a smaller gap has none
 
@@ -50,25 +50,25 @@ def _effects(found: RobotDiagnosis) -> dict[str, Any]:
         for name in v.explanation:
             out[name] = _entry(found, found.best, (name,))
     for name in v.indistinguishable:
-        having = [s for s in search.known.values() if name in s.names]
+        having = [s for s in search.fitted.values() if name in s.names]
         if having:
             out[name] = _entry(found, max(having, key=lambda s: s.score), (name,))
     return out
 
 
-def _entry(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) -> dict[str, Any]:
+def _entry(found: RobotDiagnosis, one: FittedSet, effects: tuple[str, ...]) -> dict[str, Any]:
     far = found.shrinkage
     if one is not found.best or effects != found.verdict.causes:
         far = None
     return {
         "parameters": parameters(found, one, effects),
-        "log_evidence": one.score - found.search.known[frozenset()].score,
+        "log_evidence": one.score - found.search.fitted[frozenset()].score,
         "heldout_score": 0.0 if far is None else 0.5 * (far.before - far.after) * one.linear.residual.size,
         "property_shift": {},
     }
 
 
-def parameters(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+def parameters(found: RobotDiagnosis, one: FittedSet, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     """Posteriors of a set's effects, by short name, or by effect and short name where there are several.
 
     Standard deviations are at least those of leaving out folds (the jackknife of Quenouille and Tukey), and
@@ -84,7 +84,7 @@ def parameters(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) ->
 
 
 def _posterior(
-    found: RobotDiagnosis, one: Settled
+    found: RobotDiagnosis, one: FittedSet
 ) -> tuple[dict[tuple[str, str], float], dict[tuple[str, str], float]]:
     effects, names = found.composed.effects, one.names
     keys = [(n, short) for n in names for short in effects[n].parameters]
@@ -97,7 +97,7 @@ def _posterior(
     mean = {key: float(one.point[key[0]][key[1]]) for key in keys}
     sd = dict(zip(keys, (own * usual).tolist(), strict=True))
     for key in keys:
-        rivals = [s for s in found.search.known.values() if key[0] in s.names]
+        rivals = [s for s in found.search.fitted.values() if key[0] in s.names]
         weight = np.exp(np.minimum([s.score - one.score for s in rivals], 0.0))
         apart = np.array([s.point[key[0]][key[1]] - mean[key] for s in rivals])
         sd[key] = float(np.sqrt(sd[key] ** 2 + weight @ apart**2 / weight.sum()))

@@ -27,7 +27,7 @@ Cost = Callable[[np.ndarray], float]  # of coordinates x (n,) [nats]
 Local = tuple[np.ndarray, np.ndarray]  # its curvature (n, n) and minus its gradient (n,) there
 
 
-def descended(
+def minimise(
     cost: Cost,
     local: Callable[[np.ndarray], Local],
     x: np.ndarray,
@@ -70,7 +70,7 @@ def descended(
     return x
 
 
-def moved_to(
+def fit_effects(
     composed: Composed,
     linear: Linear,
     whiten: Whiten,
@@ -97,7 +97,7 @@ def moved_to(
     if not any(free.values()):
         return point
     squares = _Squares(composed, linear, whiten, held, free)
-    x = descended(squares.cost, squares.local, squares.reached(), squares.low, squares.high, steps)
+    x = minimise(squares.cost, squares.local, squares.reached(), squares.low, squares.high, steps)
     return {**point, **squares.at(x)}
 
 

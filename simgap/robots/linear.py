@@ -175,7 +175,7 @@ def _bounded(values: np.ndarray) -> bool:
     return bool((np.abs(values) < HUGE).all())
 
 
-def wobbling(composed: Composed, linear: Linear) -> Composed:
+def with_wobble(composed: Composed, linear: Linear) -> Composed:
     """The model with the wobble of contacts by all effects that were linearised (see `Composed`)."""
     strikes = linear.rows.regime == REGIMES.index(STRIKES)
     if not (linear.starts and strikes.any() and linear.moved):

@@ -173,7 +173,7 @@ class Composed:
         for window, start in zip(windows, starts, strict=True):
             along, lead = recordings[window.log].window(window.begin, window.end), 0
             if window.regime == RESTS:
-                along, lead = settled(along)
+                along, lead = preceded_by_rest(along)
             jobs.append(Job(parameters, along, start))
             leads.append(lead)
         return [
@@ -234,7 +234,7 @@ def _sum(one: Channels | None, other: Channels, by: float) -> Channels | None:
     return one if one is None or not other else {n: v + by * other[n] for n, v in one.items()}
 
 
-def settled(window: Recording) -> tuple[Recording, int]:
+def preceded_by_rest(window: Recording) -> tuple[Recording, int]:
     """Prepend SETTLE to a window, constant as at its first sample, so that the model comes to rest where it
     would rest itself.
 

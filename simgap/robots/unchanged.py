@@ -17,7 +17,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.robust import robust_sd
 from simgap.robots.calibrate import Calibration, without_starts
-from simgap.robots.fit import Cost, Local, descended
+from simgap.robots.fit import Cost, Local, minimise
 from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed, Point, motions
 from simgap.robots.rows import resolution
@@ -130,9 +130,9 @@ class Runs:
         if not np.isfinite(self.linear.residual).all():
             raise InputError("simulator", "does not follow a whole log", "a model that stays finite")
         self.units = np.unique(unit)
-        self.scaled(self._scales() if scale is None else scale)
+        self.set_scales(self._scales() if scale is None else scale)
 
-    def scaled(self, scale: np.ndarray) -> None:
+    def set_scales(self, scale: np.ndarray) -> None:
         """Use these scales by channel (C,)."""
         self.scale = scale
         self.standard = without_starts(self.composed, self.linear, scale[self.composed.rows.channel])
@@ -151,9 +151,9 @@ class Runs:
             out[c] = np.sqrt(s2)
         return out
 
-    def rescaled(self, point: Point) -> None:
+    def rescale(self, point: Point) -> None:
         """Re-estimate the scales from what the model leaves at a point."""
-        self.scaled(self._scales(self.rows(point) * self.scale[self.composed.rows.channel]))
+        self.set_scales(self._scales(self.rows(point) * self.scale[self.composed.rows.channel]))
 
     def rows(self, point: Point) -> np.ndarray:
         """Recorded less simulated values, standardised (N,); not finite where a run diverged."""
@@ -181,7 +181,7 @@ class Runs:
                 out[:, mine] = np.nan_to_num(one.jacobian) * sizes[mine]
         return self.standard(out)
 
-    def told(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def information(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """By unit the information (M, q, q) on the columns' coordinates and minus the gradient (M, q)."""
         heavy = weights(rows)
         each = [self.unit == u for u in self.units]
@@ -208,7 +208,7 @@ def loss(rows: np.ndarray) -> np.ndarray:
     return (TAILS + 1) / 2 * np.log1p(rows**2 / TAILS)
 
 
-def halved(cost: Cost, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+def best_of_halves(cost: Cost, x: np.ndarray, step: np.ndarray) -> np.ndarray:
     """The best of a step and its halves, as straight lines may take it too far."""
     tried = [x + part * np.clip(step, -FAR, FAR) for part in (1.0, 0.5, 0.25, 0.125)]
     return min(tried, key=cost)
@@ -241,7 +241,7 @@ class Old:
         return self.information.sum(0) + self.prior
 
 
-def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarray) -> Old:
+def fit_old(composed: Composed, calibration: Calibration | None, unit: np.ndarray) -> Old:
     """Fit OLD logs of an unchanged robot, starting from its calibration.
 
     The prior is weighted by `dependence`, as rows do not count singly.
@@ -269,7 +269,7 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
 
     def told(z: np.ndarray) -> Local:  # by unit
         there = theta.point(point, z)
-        return runs.told(runs.rows(there), runs.slopes(there, theta, z))
+        return runs.information(runs.rows(there), runs.slopes(there, theta, z))
 
     def local(z: np.ndarray) -> Local:
         (information, pull), (_, bend, push) = told(z), prior(z)
@@ -277,10 +277,10 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
 
     none = np.zeros(p)
     for _ in range(ROUNDS):
-        runs.rescaled(point)
+        runs.rescale(point)
         theta = Coordinates.of(composed, point, fitted)
-        point = theta.point(point, descended(cost, local, none, far=FAR))
-        runs.rescaled(point)
+        point = theta.point(point, minimise(cost, local, none, far=FAR))
+        runs.rescale(point)
         theta = Coordinates.of(composed, point, fitted)
         information, pull = told(none)
         if p and m > 1:  # as if every row were so many
@@ -295,7 +295,7 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
 
         less = information.sum(0) - information[u] + bend
         step = np.linalg.lstsq(less, pull.sum(0) - pull[u] + push, rcond=None)[0]
-        missed[u] = runs.losses(theta.point(point, halved(without, none, step)), u)[1]
+        missed[u] = runs.losses(theta.point(point, best_of_halves(without, none, step)), u)[1]
     return Old(point, theta, runs.units, information, pull, bend, dependence, missed, runs.scale)
 
 

@@ -150,7 +150,7 @@ class Covariances:
             total += float(np.sum(solved_by(factor, sure) ** 2))
         return total
 
-    def learned(self, residual: np.ndarray, wide: Mapping[int, float] | None = None) -> Discrepancy:
+    def estimate(self, residual: np.ndarray, wide: Mapping[int, float] | None = None) -> Discrepancy:
         """The discrepancy of a residual, by maximum likelihood; none of sources that gain less than WORTH.
 
         Args:
@@ -194,7 +194,7 @@ class Covariances:
             ),
         )
 
-    def off_alone(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
+    def outliers(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
         """Windows whose residual (N,) exceeds noise and discrepancy, with the factor of their variance.
 
         A start misread where a joint came to rest moves all that follows, and no model is to explain it. One
