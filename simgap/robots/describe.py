@@ -39,18 +39,12 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
 
 def _effects(found: RobotDiagnosis) -> dict[str, Any]:
     """The best set, each of its effects, and those that could replace a cause, each at its best."""
-    v, search = found.verdict, found.search
-    out: dict[str, Any] = {}
-    if v.causes:
-        names = v.causes
-        out["+".join(names)] = _entry(found, found.best, names)
-        for name in names if len(names) > 1 else ():
-            out[name] = _entry(found, found.best, (name,))
-    elif v.explanation:
-        for name in v.explanation:
-            out[name] = _entry(found, found.best, (name,))
+    v = found.verdict
+    sets = [v.causes] if v.causes else []
+    sets += [(name,) for name in v.causes or v.explanation]
+    out = {"+".join(names): _entry(found, found.best, names) for names in sets}
     for name in v.indistinguishable:
-        having = [s for s in search.fitted.values() if name in s.names]
+        having = [s for s in found.search.fitted.values() if name in s.names]
         if having:
             out[name] = _entry(found, max(having, key=lambda s: s.score), (name,))
     return out

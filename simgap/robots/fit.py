@@ -97,7 +97,7 @@ def fit_effects(
     if not any(free.values()):
         return point
     squares = _Squares(composed, linear, whiten, held, free)
-    x = minimise(squares.cost, squares.local, squares.reached(), squares.low, squares.high, steps)
+    x = minimise(squares.cost, squares.local, squares.start(), squares.low, squares.high, steps)
     return {**point, **squares.at(x)}
 
 
@@ -130,7 +130,7 @@ class _Squares:
         self.tails = np.array([_tails(effects[e]) for e, _ in self.names])
         for effect in self.free:
             if effect in self.linear.moved:
-                self._learn(effect, self.whiten(_finite(self.linear.moved[effect].jacobian)))
+                self._learn(effect, self.whiten(np.nan_to_num(self.linear.moved[effect].jacobian)))
 
     def at(self, x: np.ndarray) -> dict[str, Mapping[str, float]]:
         """The free effects' values."""
@@ -139,15 +139,12 @@ class _Squares:
             out.setdefault(effect, {})[short] = float(value)
         return dict(out)
 
-    def coordinates(self, point: Point) -> np.ndarray:
-        """The coordinates of a point, clipped to bounds; effects that it does not name are neutral."""
-        neutral = {e: self.composed.effects[e].neutral() for e in self.free}
-        value = np.array([{**neutral[e], **point.get(e, {})}[p] for e, p in self.names])
-        return np.clip((value - self.nominal) / self.sd, self.low, self.high)
-
-    def reached(self) -> np.ndarray:
+    def start(self) -> np.ndarray:
         """Where to begin: the point, halved towards the linearisation's while it is worse than that."""
-        here, x = self.coordinates(self.linear.point), self.coordinates(self.free)
+        neutral = {e: self.composed.effects[e].neutral() for e in self.free}
+        both = self.linear.point, self.free
+        values = np.array([[{**neutral[e], **p.get(e, {})}[n] for e, n in self.names] for p in both])
+        here, x = np.clip((values - self.nominal) / self.sd, self.low, self.high)
         if np.array_equal(here, x):
             return x
         cost = self.cost(here)
@@ -190,7 +187,7 @@ class _Squares:
             size = len(self.composed.effects[effect].parameters)
             white = np.zeros((self.linear.residual.size, size))
             if moved is not None:
-                white = self.whiten(_finite(moved.jacobian))
+                white = self.whiten(np.nan_to_num(moved.jacobian))
                 self._learn(effect, white)
             columns.append(white)
         slope = _slope(x, self.tails)
@@ -222,10 +219,6 @@ def _tails(effect: RobotEffect) -> float:
     """The scale of an effect's heavy-tailed prior: how many of its usual sizes its `sd` is; 0 of a normal
     prior."""
     return effect.widened if effect.widened else float(not effect.fitted)
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, 0.0)
 
 
 def _prior(x: np.ndarray, tails: np.ndarray) -> np.ndarray:

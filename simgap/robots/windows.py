@@ -73,7 +73,8 @@ def cut(
         touching = _touching(simulator, log)
         rests = touching & resting(log, reach)
         turns = np.flatnonzero(np.diff(rests.astype(int))) + 1
-        marks = [*_marks(simulator, log), *log.t[turns].tolist()]
+        contacts = getattr(simulator, "contacts", None)
+        marks = [*([] if contacts is None else map(float, contacts(log))), *log.t[turns].tolist()]
         edges = _edges(log, marks, length)
         edges[0] = _readable(simulator, log, edges[1])
         for begin, end in itertools.pairwise(edges):
@@ -146,12 +147,6 @@ def travel(values: np.ndarray) -> float:
     """The range of values (n,), NaN left out."""
     seen = values[np.isfinite(values)]
     return float(np.ptp(seen)) if seen.size else 0.0
-
-
-def _marks(simulator: Simulator, log: Recording) -> list[float]:
-    """Times [s] of the log at which contacts change."""
-    contacts = getattr(simulator, "contacts", None)
-    return [] if contacts is None else [float(t) for t in contacts(log)]
 
 
 def _touching(simulator: Simulator, log: Recording) -> np.ndarray:

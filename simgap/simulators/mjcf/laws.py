@@ -71,9 +71,8 @@ class Laws:
 def _friction(model: Any, joint: str, own: Mapping[str, float]) -> _Friction:
     j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{joint}{MOTOR}")
     dof = int(model.jnt_dofadr[object_id(model, "joint", joint) if j < 0 else j])
-    return _Friction(dof, own.get("load_friction", 0.0), own.get("direction_friction", 0.0),
-                     own.get("stribeck_extra", 0.0), max(own.get("stribeck_speed", 1.0), 1e-9),
-                     own.get("quadratic_drag", 0.0))  # fmt: skip
+    share, skew, extra, speed, drag = ({"stribeck_speed": 1.0, **own}.get(n, 0.0) for n in OF_JOINTS)
+    return _Friction(dof, share, skew, extra, max(speed, 1e-9), drag)
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:

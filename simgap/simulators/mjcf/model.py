@@ -59,6 +59,7 @@ class MjcfSimulator:
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
         self._nominal = {n: s.nominal for n, s in self.settings.items()}
+        self.uncertain, self.sd = self.map.uncertain, self.map.sd  # as the diagnosis asks for them
 
     def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
         """One run; its channels are NaN where it diverged."""
@@ -146,22 +147,12 @@ class MjcfSimulator:
     @property
     def numerics(self) -> frozenset[str]:
         """Parameters of the simulation rather than the robot."""
-        return frozenset(n for n, s in self.settings.items() if s.mixed is not None or n in (HOLD, LATE))
+        return self.dear | ({HOLD, LATE} & self.settings.keys())
 
     @property
     def dear(self) -> frozenset[str]:
         """Those of them that cost a second run."""
         return frozenset(n for n, s in self.settings.items() if s.mixed is not None)
-
-    @property
-    def uncertain(self) -> tuple[str, ...]:
-        """Patterns of what was never measured, from the map."""
-        return self.map.uncertain
-
-    @property
-    def sd(self) -> Mapping[str, float]:
-        """Standard deviations by effect, from the map."""
-        return self.map.sd
 
     @property
     def states(self) -> tuple[str, ...]:
