@@ -125,9 +125,7 @@ def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
 
 
 STRAY = 1e-3  # prior: share of resting samples that move: settling contacts have states of their own here
-CLOSED = (
-    1e-3  # prior: share of blocks released where they stand by fingers that slide off them, without opening
-)
+CLOSED = 1e-3  # prior: share of blocks released in place by fingers that slide off without opening
 RINGING = 0.1  # prior: share of samples that ring while a contact settles
 ROUNDS = 8  # numerics: most iterations; it converges sooner
 # cited: s; a shorter touch cannot have been meant as a lift: grip and load forces rise in turn before a lift,
