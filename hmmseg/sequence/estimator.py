@@ -79,8 +79,11 @@ class OrderedSegmenter(ClusterMixin, BaseEstimator):
 
     def _checked(self, X: Any, reset: bool) -> list[np.ndarray]:
         least = max(8, 2 * self.n_states)
-        return [validate_data(self, each, reset=reset and k == 0, dtype=float, ensure_min_samples=least)
-                for k, each in enumerate(X if _several(X) else [X])]  # fmt: skip
+        found: list[Any] = [
+            validate_data(self, each, reset=reset and k == 0, dtype=float, ensure_min_samples=least)
+            for k, each in enumerate(X if _several(X) else [X])
+        ]
+        return found
 
     def _trials(self, sequences: Sequence[np.ndarray]) -> list[Trial]:
         return [Trial(f"sequence{k}", np.arange(len(x)) / self.rate, {f"x{c}": v for c, v in enumerate(x.T)})

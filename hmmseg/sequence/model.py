@@ -43,7 +43,7 @@ class NamedCourse:
     """A course (`hmmseg.sequence.courses`) on the fine grid, and which of its changes are the boundaries.
 
     `probability`: of the course; `naming` (num_boundaries, num_changes): that boundary b is change j, summing
-    to 1 over j; `shift` (num_boundaries, num_changes) [cells]: mean lag of labelled boundaries behind changes.
+    to 1 over j; `shift` (num_boundaries, num_changes) [cells]: mean lag of labelled boundaries behind it.
     """
 
     probability: float
