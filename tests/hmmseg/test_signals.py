@@ -15,8 +15,7 @@ from hmmseg.contact.equations import rolled_offset, turned
 from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, require_reach, tip_velocity
 from hmmseg.hand.read import read_trial
-from hmmseg.hand.roll import levelled
-from hmmseg.hand.signals import Signals, late_differences, one_sided, task_space, timely
+from hmmseg.hand.signals import Signals, late_differences, levelled, one_sided, task_space, timely
 from hmmseg.hand.tool import smooth
 from hmmseg.io.rig import Finger, Fingertip, Noise, Rig, parse_rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, ROLL, Trial
