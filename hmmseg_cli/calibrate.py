@@ -1,4 +1,4 @@
-"""`hmmseg calibrate`: what nobody measured of a robot's model, fitted to its logs."""
+"""`hmmseg calibrate`: unmeasured parameters of a robot's model, fitted to its logs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def calibrate(
 
 
 def tables(document: dict[str, Any]) -> list[Table]:
-    """Parameters, what is determined only jointly, the simulation's own numbers, and held-out logs."""
+    """Tables of parameters and of residuals on held-out logs."""
     sums = [
         {"name": " + ".join(n if c == 1 else f"{c:.3g} {n}" for n, c in one["of"].items()), **one}
         for one in document["combinations"]
@@ -53,13 +53,13 @@ def tables(document: dict[str, Any]) -> list[Table]:
     named = [{"name": n, **p} for n, p in (document["parameters"] | document["numerics"]).items()]
     rows = []
     for p in (*named, *sums):
-        shown, known = shown_as(p["unit"]), ("undetermined", "")
+        shown, value = shown_as(p["unit"]), ("undetermined", "")
         nominal = "" if "nominal" not in p else f"{shown[0] * p['nominal']:.4g} {shown[1]}"
         if p["mean"] is not None:
-            known = estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown=shown)
-        rows.append((p["name"], nominal, *known))
+            value = estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown=shown)
+        rows.append((p["name"], nominal, *value))
     heads = ("parameter", "the model has", "calibrated", "90 % interval")
     after = document["heldout"]["after"]
     rms = [(n, f"{v:.4g}", f"{after[n]:.4g}") for n, v in document["heldout"]["before"].items()]
-    told = listed("free runs along held-out logs, rms", ("channel", "as the model came", "calibrated"), rms)
-    return [listed("parameters", heads, rows), told]
+    columns = ("channel", "as the model came", "calibrated")
+    return [listed("parameters", heads, rows), listed("free runs along held-out logs, rms", columns, rms)]

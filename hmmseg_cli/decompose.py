@@ -25,7 +25,7 @@ def decompose(
 
 
 def in_words(found: Any) -> list[str]:
-    """Of every object, which subtasks reveal what."""
+    """For each object, which subtasks reveal which property."""
     lines = []
     for name, known in found.properties.items():
         parts = []

@@ -34,7 +34,7 @@ def identify(
 def run(
     out: Output, trials: Sequence[Path], task: Path, rig: Path, method: Estimator, actual: Path | None
 ) -> dict[str, Any]:
-    """Identify, put table, figures and page where `out` has them go, and give the document."""
+    """Identify, write table, figures and page to the destinations of `out`, and return the document."""
     paths = distinct_trials(trials)
     description = read_task(task)
     if not isinstance(description, BlockTask):
@@ -76,7 +76,7 @@ def run(
 def _paper(
     out: Output, recordings: Sequence[Trial], task: BlockTask, hand: Rig
 ) -> tuple[dict[str, Any], list[Segmentation]]:
-    """The paper's thresholds and formulas: the document's body, and the segmentations."""
+    """The paper's thresholds and formulas: body of the document, and segmentations."""
     from estimation.paper_formulas import estimate_plugin
     from hmmseg.hand.signals import task_space
     from hmmseg.segmentation.thresholds import segment_qualitative

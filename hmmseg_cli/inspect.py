@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from hmmseg.hand.inspect import Inspection
 
 BARS = "▁▂▃▄▅▆▇█"
-# Names that `hmmseg new` gives a gripper's columns until somebody says which they are.
-LAID_OUT = {"x", "y", "z", "opening", "fx", "fy", "fz", "tx", "ty", "tz"}
+# Names of a gripper's columns in the template of `hmmseg new`, before they are filled in.
+TEMPLATE_NAMES = {"x", "y", "z", "opening", "fx", "fy", "fz", "tx", "ty", "tz"}
 
 
 def inspect(
@@ -41,7 +41,7 @@ def inspect(
 
 
 def extended(rig_file: Path, found: Sequence[Inspection]) -> str:
-    """The rig's text with the mapping added; InputError where there is one, or none to add."""
+    """The rig's text with the mapping added; InputError if it has one already, or none was found."""
     proposed = list(dict.fromkeys(each.toml for each in found if each.toml))
     if not proposed:
         raise InputError(
@@ -51,13 +51,13 @@ def extended(rig_file: Path, found: Sequence[Inspection]) -> str:
         raise InputError(f"--write {rig_file}", "the files need different mappings", "one at a time")
     text = rig_file.read_text(encoding="utf-8") if rig_file.exists() else ""
     now = parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
-    laid_out = now.gripper is not None and set(now.gripper.channels) <= LAID_OUT
+    unfilled = now.gripper is not None and set(now.gripper.channels) <= TEMPLATE_NAMES
     import tomlkit
 
     document = tomlkit.parse(text)
     for name, table in tomlkit.parse(proposed[0]).items():
         there = document.get(name)
-        if there and not (name == "gripper" and laid_out):
+        if there and not (name == "gripper" and unfilled):
             raise InputError(f"--write {rig_file}", f"already has [{name}]", "a rig without it")
         if there is None:
             document.add(tomlkit.nl())
@@ -85,17 +85,17 @@ def _show(out: Output, found: Inspection) -> None:
     ]  # fmt: skip
     out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
     out.warn(*found.said)
-    then = f"hmmseg segment {found.file} --task task.toml"
+    segment = f"hmmseg segment {found.file} --task task.toml"
     if found.toml:
         out.print("proposed for rig.toml:")
-        said = f"{found.toml}\nnext: hmmseg inspect {found.file} --write rig.toml, or copy it there"
+        text = f"{found.toml}\nnext: hmmseg inspect {found.file} --write rig.toml, or copy it there"
     elif not found.understood:
-        said = (f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
+        text = (f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
                 "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"
-                f'sequence = ["...", "..."] in task.toml, then: {then}')  # fmt: skip
+                f'sequence = ["...", "..."] in task.toml, then: {segment}')  # fmt: skip
     else:
-        said = f"{found.file}: all columns understood; next: {then} --rig rig.toml"
-    out.print(said, whole=True)
+        text = f"{found.file}: all columns understood; next: {segment} --rig rig.toml"
+    out.print(text, whole=True)
 
 
 def _number(value: float | None) -> str:
@@ -103,11 +103,11 @@ def _number(value: float | None) -> str:
 
 
 def sparkline(course: tuple[float, ...]) -> str:
-    """A course in bars, a blank where nothing is."""
+    """A course as bars, blank where it is missing."""
     there = [value for value in course if value == value]
     if not there:
         return ""
-    low, high = min(there) / 8, max(there) / 8  # the difference of two numbers may be beyond all of them
+    low, high = min(there) / 8, max(there) / 8  # the difference of the values themselves may overflow
     steps = [int(8 * (v / 8 - low) / (high - low)) if v == v and high > low else 0 for v in course]
     return "".join(" " if v != v else BARS[min(7, k)] for v, k in zip(course, steps, strict=True))
 

@@ -1,7 +1,7 @@
 """The `hmmseg` command and its exit codes.
 
-0: done, whatever was found. 2: the input is at fault; one line on standard error says where.
-Any other exception is a bug and shows its traceback; what the machine refuses (memory, a disk) is not.
+0: done, whatever was found. 2: the input is at fault, as one line on standard error says, or the machine
+refuses (memory, a disk). Any other exception is a bug and shows its traceback.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from hmmseg_cli import (
 )
 from hmmseg_cli.console import Grouped, Hmmseg, discard, visible
 
-# numerics: objects between two garbage collections: most are modules' and compilers', which stay anyway
+# numerics: objects between two garbage collections: most belong to modules and compilers, and stay anyway
 COLLECTED = 10_000
 
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
@@ -98,14 +98,14 @@ def _hmmseg(
     """Identify an object's weight, width, height and friction from what a robot hand felt."""
 
 
-AGAIN = 0.02  # numerics: s; the callback has returned by then, and if not it is sent once more
+AGAIN = 0.02  # numerics: s until an interrupt is repeated; the callback has usually returned by then
 
 
 @contextlib.contextmanager
 def heard() -> Iterator[None]:
-    """Within it no interrupt is lost, or reported with a traceback.
+    """Lose no interrupt, and report none with a traceback.
 
-    A Ctrl-C that comes while a compiler calls back into Python is dropped there, and sent again here.
+    A Ctrl-C that arrives while a compiler calls back into Python is dropped there, and repeated here.
     """
     usual, waiting = sys.unraisablehook, []
 
@@ -163,7 +163,7 @@ def _at_fault(line: str) -> int:
 
 
 def _open_streams() -> None:
-    """Streams that were closed refuse what is written to them; names that are no UTF-8 can be printed."""
+    """Replace closed streams, and let names that are not UTF-8 be printed."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:

@@ -58,7 +58,7 @@ def new(
 
 
 def _seen(hand: Hand | None, looked: Inspection) -> tuple[Hand, float]:
-    """The hand and its rate [Hz], from what a recording has."""
+    """The hand and its sampling rate [Hz], from a recording."""
     names = {channel.name for channel in looked.channels} | set(looked.mapping or ())
     if hand is None and "[gripper]" in looked.toml:
         hand = Hand.GRIPPER
@@ -69,7 +69,7 @@ def _seen(hand: Hand | None, looked: Inspection) -> tuple[Hand, float]:
 
 
 def _lay_out_map(out: Output, path: Path, mjcf: Path, source: Path, looked: Inspection) -> None:
-    """Lay out a map.toml: columns of a log with the parts of a model whose names they hold."""
+    """Write a map.toml that matches columns of a log with parts of the model by name."""
     from simgap.simulators.mjcf.map import proposed_map
 
     text, open_columns = proposed_map(mjcf, [(c.name, c.unit) for c in looked.channels if not c.text])

@@ -80,8 +80,9 @@ def _segment_blocks(
     out: Output, paths: Sequence[Path], task: BlockTask, rig_file: Path,
     thresholds: tuple[float, float] | None, lean: bool,
 ) -> tuple[list[Trial], list[Segmentation]]:  # fmt: skip
-    """The recordings and their segmentations, by the paper's thresholds where such are given. Long ones of a
-    repeated task are read from disk where nothing else needs them (`lean`)."""
+    """Recordings and their segmentations, by the paper's `thresholds` if given, else by the HMM.
+
+    Long recordings of a repeated task are read from disk if nothing else needs them (`lean`)."""
     from hmmseg.hand.read import is_long
     from hmmseg.hand.signals import task_space
     from hmmseg.segmentation.align import segment
@@ -100,7 +101,7 @@ def _segment_blocks(
 def _segment_apart(
     out: Output, paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None
 ) -> list[Segmentation]:
-    """Each recording by itself, in other processes."""
+    """Segment each recording by itself, in other processes."""
     found = []
     with out.progress("segmenting", len(paths)) as advance:
         for each in segment_apart(paths, task, rig, workers, scheduler, advance, out.warn):
@@ -114,7 +115,7 @@ def _segment_apart(
 
 
 def _segment_long(out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig) -> list[Segmentation]:
-    """Each recording by itself, from disk; what cannot be is judged by its beginning."""
+    """Segment each recording by itself, from disk, after checking its beginning."""
     from hmmseg.hand.read import LongRecording, check
     from hmmseg.segmentation.align import segment_long
 
@@ -137,7 +138,7 @@ def _segment_sequence(
 
 
 def warn_of_misfits(out: Output, found: Sequence[Segmentation]) -> None:
-    """Say which subtask each trial fails at that does, in every repetition that does."""
+    """Warn of the subtask at which each misfit fails, in every repetition that does."""
     for segmentation in found:
         failures = segmentation.failures or filter(None, [segmentation.failed])
         out.warn(*(f"{segmentation.file}: {failure}" for failure in failures))
