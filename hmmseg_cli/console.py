@@ -242,7 +242,7 @@ MAPS = {"columns", "topics"}  # keys of a rig that map columns, as `inspect --wr
 NO_HAND = MAPS | {"rate", "gravity"}  # keys that describe no hand
 
 
-def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
+def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
     """Task and rig of these trials: as given, else task.toml and rig.toml in the folder of the first.
 
     InputError if there is no task, or if one is given as the other.
@@ -265,7 +265,7 @@ def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tu
     return found[0], found[1]
 
 
-def needed(rig: Path | None, trials: Sequence[Path]) -> Path:
+def require_rig(rig: Path | None, trials: Sequence[Path]) -> Path:
     """The rig of a task of blocks; InputError if there is none."""
     if rig is None:
         folder = split_part(trials[0])[0].parent
@@ -413,7 +413,7 @@ class _Screen(Console):
             if segment.control:
                 yield segment
             else:
-                yield Segment(visible(segment.text), segment.style)
+                yield Segment(escape_control(segment.text), segment.style)
 
     @contextlib.contextmanager
     def unless_lost(self) -> Iterator[None]:
@@ -437,7 +437,7 @@ def discard(stream: Any) -> None:
 CONTROL = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
 
 
-def visible(text: str) -> str:
+def escape_control(text: str) -> str:
     """The text with control characters as \\x1b: file names may contain any."""
     return text.translate(CONTROL)
 

@@ -12,8 +12,16 @@ from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, SequenceTask, read_task
 from hmmseg.numbers import percent
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Grouped, Output, check_folder, described, distinct_trials, needed, read_trials
-from hmmseg_cli.diagnose_robot import OwnSimulator, compare_robot, diagnose_robot
+from hmmseg_cli.console import (
+    Grouped,
+    Output,
+    check_folder,
+    distinct_trials,
+    find_inputs,
+    read_trials,
+    require_rig,
+)
+from hmmseg_cli.robot import OwnSimulator, compare_robot, diagnose_robot
 from simgap.report.finding import plain_name, sentence, settles, tables
 
 if TYPE_CHECKING:
@@ -70,7 +78,7 @@ def diagnose(
             else:
                 diagnose_robot(out, paths, own, task, effect or [])
             return
-        task, rig = described(paths, task, rig)
+        task, rig = find_inputs(paths, task, rig)
         description = read_task(task)
         if against:
             refuse("does not go with --against", {"--patch": patch, "--healthy": healthy, "--actual": actual})
@@ -79,7 +87,7 @@ def diagnose(
         if not isinstance(description, BlockTask):
             raise InputError(str(task), "a plain ordered task has no virtual model", "--against SIM")
         refuse("goes only with a plain ordered task", {"--model": model})
-        rig = needed(rig, paths)
+        rig = require_rig(rig, paths)
         hand = read_rig(rig)
         if patch is not None:
             check_folder("--patch", patch)
@@ -162,7 +170,7 @@ def _against(
     hand, every, count = None, distinct_trials([*paths, *against]), len(paths)
     if isinstance(task, BlockTask):
         refuse("goes only with a plain ordered task", {"--model": model_file})
-        hand = read_rig(needed(rig_file, paths))
+        hand = read_rig(require_rig(rig_file, paths))
     read = read_trials(out, every, hand, None if isinstance(task, BlockTask) else task)
     with out.progress("diagnosing", total=3) as advance:
         if isinstance(task, BlockTask):

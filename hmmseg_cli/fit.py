@@ -15,7 +15,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import SequenceTask, read_task
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Output, check_file, described, distinct_trials, read_trials
+from hmmseg_cli.console import Output, check_file, distinct_trials, find_inputs, read_trials
 
 
 def fit(
@@ -26,7 +26,7 @@ def fit(
     with Output("fit", json=json, seed=seed, quiet=quiet) as out:
         check_file("--model", model, suffixes=(".npz",))
         paths = distinct_trials(trials)
-        task, rig = described(paths, task, rig)
+        task, rig = find_inputs(paths, task, rig)
         description = read_task(task)
         if not isinstance(description, SequenceTask):
             raise InputError(str(task), "a task of blocks needs no fitting: its emissions are physics",

@@ -10,7 +10,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Output, described, distinct_trials, needed, read_trials
+from hmmseg_cli.console import Output, distinct_trials, find_inputs, read_trials, require_rig
 from hmmseg_cli.options import Estimator
 from hmmseg_cli.segment import warn_of_misfits
 
@@ -27,8 +27,8 @@ def identify(
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
-        found, hand = described(trials, task, rig)
-        out.finish(run(out, trials, found, needed(hand, trials), method, actual))
+        found, hand = find_inputs(trials, task, rig)
+        out.finish(run(out, trials, found, require_rig(hand, trials), method, actual))
 
 
 def run(

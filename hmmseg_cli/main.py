@@ -21,22 +21,20 @@ import hmmseg
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import configure
 from hmmseg_cli import (
-    calibrate,
-    decompose,
     demo,
+    describe,
     diagnose,
     doctor,
-    effects,
     fit,
     identify,
     inspect,
-    new,
     play,
+    robot,
     segment,
     simulate,
     watch,
 )
-from hmmseg_cli.console import Grouped, Hmmseg, discard, visible
+from hmmseg_cli.console import Grouped, Hmmseg, discard, escape_control
 
 # numerics: objects between two garbage collections: most belong to modules and compilers, and stay anyway
 COLLECTED = 10_000
@@ -52,9 +50,9 @@ app = typer.Typer(cls=Hmmseg, rich_markup_mode=None, context_settings={"help_opt
 COMMANDS = {
     "Begin": {
         demo.demo: "hmmseg demo",
-        new.new: "hmmseg new my_hand --from trial_01.csv",
+        inspect.new: "hmmseg new my_hand --from trial_01.csv",
         inspect.inspect: "hmmseg inspect trial_01.csv",
-        decompose.decompose: "hmmseg decompose task.toml",
+        describe.decompose: "hmmseg decompose task.toml",
         doctor.doctor: "hmmseg doctor",
     },
     "When and what": {
@@ -64,9 +62,9 @@ COMMANDS = {
         fit.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
     },
     "Why simulation and recording differ": {
-        calibrate.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",
+        robot.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",
         diagnose.diagnose: diagnose.EXAMPLES,
-        effects.effects: "hmmseg effects",
+        describe.effects: "hmmseg effects",
     },
     "The virtual blocks": {
         simulate.simulate: "hmmseg simulate --task task.toml --rig rig.toml --properties result.json",
@@ -102,7 +100,7 @@ AGAIN = 0.02  # numerics: s until an interrupt is repeated; the callback has usu
 
 
 @contextlib.contextmanager
-def heard() -> Iterator[None]:
+def repeat_interrupts() -> Iterator[None]:
     """Lose no interrupt, and report none with a traceback.
 
     A Ctrl-C that arrives while a compiler calls back into Python is dropped there, and repeated here.
@@ -133,7 +131,7 @@ def main(args: Sequence[str] | None = None) -> int:
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
     command = typer.main.get_command(app)
     try:
-        with heard():
+        with repeat_interrupts():
             code = command.main(args, prog_name="hmmseg", standalone_mode=False) or 0
             sys.stdout.flush()
             return code
@@ -154,7 +152,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def _at_fault(line: str) -> int:
     with contextlib.suppress(OSError, ValueError):
-        print(visible(" ".join(line.split())), file=sys.stderr)
+        print(escape_control(" ".join(line.split())), file=sys.stderr)
     try:
         sys.stdout.flush()
     except (OSError, ValueError):

@@ -13,7 +13,7 @@ from hmmseg.io.task import BlockTask, SequenceTask, read_task
 from hmmseg.segmentation.spans import most_telling, spans_table, trials_table
 from hmmseg_cli import options as opt
 from hmmseg_cli.batch import recordings_in, segment_apart
-from hmmseg_cli.console import Output, described, distinct_trials, needed, read_trials
+from hmmseg_cli.console import Output, distinct_trials, find_inputs, read_trials, require_rig
 from hmmseg_cli.options import Segmenter
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def segment(
         apart, recordings = workers is not None or scheduler is not None, []
         paths = distinct_trials(recordings_in(trials) if apart else trials)
         check_destination(write, paths)
-        task, rig = described(paths, task, rig)
+        task, rig = find_inputs(paths, task, rig)
         description = read_task(task)
         if isinstance(description, SequenceTask):
             if apart:
@@ -49,7 +49,7 @@ def segment(
                 raise InputError("--method qualitative", "needs a task of blocks", "--method hmm")
             recordings, found = _segment_sequence(out, paths, description, rig, model)
         else:
-            rig = needed(rig, paths)
+            rig = require_rig(rig, paths)
             if model is not None:
                 raise InputError(f"--model {model}", "goes only with a plain ordered task")
             if not apart:

@@ -85,7 +85,7 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
         raise InputError(str(path), "is empty", "a header row and a row for every sample")
     already = {} if rig is None else (rig.topics if table.messages else rig.columns)
     entries = {} if already else propose(table)
-    entries, said = mended(table, entries, rig)
+    entries, said = correct(table, entries, rig)
     by_length: dict[int, list[str]] = {}
     for name, values in table.columns.items():
         by_length.setdefault(len(values), []).append(name)
@@ -176,7 +176,7 @@ def propose(table: Table) -> dict[str, dict[str, Any]]:
     sources: dict[str, str] = {} if table.messages else _time_column(names)
     for channels in (CARTESIAN_CHANNELS, JOINT_CHANNELS):
         found = {channel: channel for channel in channels if channel in names}
-        found |= {channel: name for channel, name in _matched(names, table).items()
+        found |= {channel: name for channel, name in _match_channels(names, table).items()
                   if channel in channels and channel not in found}  # fmt: skip
         if len(found) > len(channels) / 2:
             sources |= found
@@ -192,7 +192,7 @@ def propose(table: Table) -> dict[str, dict[str, Any]]:
     return out
 
 
-def mended(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = None
+def correct(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = None
            ) -> tuple[dict[str, dict[str, Any]], list[str]]:  # fmt: skip
     """The proposal corrected by the checks of the recording, and their findings, line by line.
 
@@ -236,11 +236,11 @@ def _time_column(names: Sequence[str]) -> dict[str, str]:
     return {}
 
 
-def _matched(names: Sequence[str], table: Table) -> dict[str, str]:
+def _match_channels(names: Sequence[str], table: Table) -> dict[str, str]:
     """The first column that fits each of our channels, with the axes of the work renamed to x and y."""
     found: dict[str, str] = {}
-    for name, parts in split(names).items():
-        channel = _meant(parts)
+    for name, parts in split_names(names).items():
+        channel = _channel_meant(parts)
         if channel is not None:
             found.setdefault(channel, name)
     across, up = _plane(found, table)
@@ -276,7 +276,7 @@ def _plane(found: Mapping[str, str], table: Table) -> tuple[str, str]:
     return max(apart, key=lambda axis: apart[axis]), up
 
 
-def split(names: Sequence[str]) -> dict[str, list[str]]:
+def split_names(names: Sequence[str]) -> dict[str, list[str]]:
     """Words of each name; entries of a vector of three or four end in their axis instead of their index."""
     out = {}
     for name in names:
@@ -286,7 +286,7 @@ def split(names: Sequence[str]) -> dict[str, list[str]]:
     return out
 
 
-def _meant(words: list[str]) -> str | None:
+def _channel_meant(words: list[str]) -> str | None:
     """Our channel (with z for a third axis) that the words of a name mean; None if they mean none."""
     known = set(words)
     finger = "1" if known & LEFT else "2" if known & RIGHT else None
@@ -328,7 +328,7 @@ def propose_gripper(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> s
 
     `entries`: those already proposed for `[columns]` or `[topics]`.
     """
-    named = split(table.names)
+    named = split_names(table.names)
     forces = _by_axis(named, FORCE, TORQUE | MOVING | {"grip", "gripper", "finger"})
     never = FORCE | TORQUE | MOVING | TURN | OPENING - {"gripper"}
     places = _by_axis(named, TOOL, never | {"to", "rel", "relative"}) or _by_axis(named, PLACE, never)

@@ -125,7 +125,7 @@ def check_clock(trial: Trial, rig: Rig | None, moving: bool = True) -> list[Find
     return found
 
 
-def judged(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
+def judge(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
     """Warnings about a trial; InputError for the first certain finding."""
     warnings = []
     for finding in findings:

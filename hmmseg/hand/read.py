@@ -22,11 +22,11 @@ from hmmseg.hand.plausibility import (
     check_lengths,
     check_signs,
     check_velocities,
-    judged,
+    judge,
 )
-from hmmseg.hand.sensing import SPARSE, check_noise, sensed
-from hmmseg.hand.signals import levelled
-from hmmseg.hand.wrist import check_gripper, from_halves, halved, two_fingers
+from hmmseg.hand.sensing import SPARSE, check_noise, remove_faults
+from hmmseg.hand.signals import remove_roll
+from hmmseg.hand.wrist import check_gripper, is_halved, join_halves, two_fingers
 from hmmseg.io.formats import LOGS, kind_of, pieces_of, read_table, rows_of, split_part
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.table import frame_table
@@ -69,15 +69,15 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     table = read(source, theirs)
     trial = trial_of(table, rig, task)
     if task is not None or rig is None:
-        warnings = judged(trial, check_clock(trial, rig, moving=False))
+        warnings = judge(trial, check_clock(trial, rig, moving=False))
         return replace(trial, warnings=(*trial.warnings, *warnings))
-    trial = sensed(trial, rig)
+    trial = remove_faults(trial, rig)
     warnings = check(trial, rig)
-    trial = levelled(trial)
+    trial = remove_roll(trial)
     if rig.gripper is not None:
         trial = two_fingers(trial, rig)
-    elif halved(trial):
-        trial = from_halves(trial, rig)
+    elif is_halved(trial):
+        trial = join_halves(trial, rig)
     return replace(trial, warnings=(*trial.warnings, *warnings))
 
 
@@ -88,7 +88,7 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
     """
     out: list[Finding] = []
     looks = [check_clock, check_lengths, check_angles, check_velocities, check_forces]
-    if not halved(trial):  # forces of a wrist have no sides
+    if not is_halved(trial):  # forces of a wrist have no sides
         forces = [trial.channels[name] for name in FORCE_CHANNELS if name in trial.channels]
         felt = all(np.mean(np.isnan(force)) < SPARSE for force in forces)  # often enough to judge signs by
         looks += [check_noise, check_axes, check_signs] if felt else [check_noise]
@@ -105,7 +105,7 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
 
 def check(trial: Trial, rig: Rig) -> tuple[str, ...]:
     """Warnings about a trial; InputError for what is impossible."""
-    return judged(trial, findings(trial, rig))
+    return judge(trial, findings(trial, rig))
 
 
 def is_long(path: str | Path) -> bool:
@@ -170,7 +170,7 @@ class LongRecording:
         names, _ = channels_of(self.rig, None)
         wanted = [source_of(name, self.rig.columns) for name in ("t", *(names or ()))]
         for table in pieces_of(self.path, wanted, self.piece, MIN_SAMPLES):
-            trial = levelled(trial_of(table, self.rig, None, whole=False))
+            trial = remove_roll(trial_of(table, self.rig, None, whole=False))
             if trial.origin is not None:
                 self._origin = trial.origin if self._origin is None else self._origin
                 trial = replace(trial, t=trial.t + (trial.origin - self._origin) * 1e-9)

@@ -40,7 +40,7 @@ def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
         return []
     forces = [trial.channels[name] for name in names]
     shown = noise_of(forces)
-    unit, off = _nearest(rig.noise.force / shown) if shown > 0 else ("", np.inf)
+    unit, off = _nearest_unit(rig.noise.force / shown) if shown > 0 else ("", np.inf)
     if off > NEAR or (UNITS[unit][1] > 1 and whiteness(forces) > WHITE):
         return []  # a filter reduces noise, too, but correlates neighbours
     stated = f"where [noise] force = {rig.noise.force:g} N in rig.toml"
@@ -54,28 +54,30 @@ def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     gripper = rig.wrist
     names, inertia, stated = gripper.wrench[:3], abs(tool.inertia), gripper.tool_mass
     where = f"{trial.file}: columns {', '.join(names)}"
-    likely = LIGHTEST < inertia < HEAVIEST if stated is None else _nearest(stated / inertia)[1] > np.log(2)
+    likely = LIGHTEST < inertia < HEAVIEST
+    if stated is not None:
+        likely = _nearest_unit(stated / inertia)[1] > np.log(2)
     if likely and tool.weighed and abs(tool.mass / tool.inertia - 1) > NEAR:
         said = "is stated to weigh" if stated is not None else "weighs, as it turns,"
         return (f"{where}: the tool {said} {tool.mass:.3g} kg and moves like one of {tool.inertia:.3g} kg; "
                 "expected one mass: gains, axes or tool_mass under [gripper] are wrong",)  # fmt: skip
     if likely:
         return ()
-    unit, _ = _nearest((USUAL_TOOL if stated is None else stated) / inertia)
+    unit, _ = _nearest_unit((USUAL_TOOL if stated is None else stated) / inertia)
     expected = f"{LIGHTEST:g} to {HEAVIEST:g} kg" if stated is None else f"{stated:g} kg in rig.toml"
     remedy = Finding(names[0], "", changed(names, rig, unit=unit)).remedy
     text = f"move a tool of {inertia:.3g} kg ({expected}): they look like {unit}; expected {remedy}"
     return (f"{where} {text}",)
 
 
-def _nearest(size: float) -> tuple[str, float]:
+def _nearest_unit(size: float) -> tuple[str, float]:
     """The unit of force nearest to a size [N], and the absolute logarithm of their ratio."""
     off = {unit: abs(float(np.log(size / UNITS[unit][1]))) for unit in FORCES}
     unit = min(off, key=lambda name: off[name])
     return unit, off[unit]
 
 
-def _quiet(channels: list[np.ndarray]) -> list[np.ndarray]:
+def _quiet_differences(channels: list[np.ndarray]) -> list[np.ndarray]:
     """Second differences in the quietest quarter of stretches, which has no contacts."""
     every = [v[np.isfinite(v)] for v in channels]
     pieces = [
@@ -87,14 +89,14 @@ def _quiet(channels: list[np.ndarray]) -> list[np.ndarray]:
 
 def whiteness(channels: list[np.ndarray]) -> float:
     """Correlation of neighbouring second differences of the noise, -2/3 if it is white."""
-    pieces = _quiet(channels)
+    pieces = _quiet_differences(channels)
     total = sum(float(piece @ piece) for piece in pieces)
     return sum(float(piece[1:] @ piece[:-1]) for piece in pieces) / total if total > 0 else 0.0
 
 
 def noise_of(channels: list[np.ndarray]) -> float:
     """Noise standard deviation of one sample, from the noisiest stretch of the quietest quarter."""
-    pieces = _quiet(channels)
+    pieces = _quiet_differences(channels)
     return float(np.sqrt(np.mean(pieces[-1] ** 2) / 6)) if pieces else 0.0
 
 
@@ -136,35 +138,35 @@ class Fault:
         return f"{self.channel} {self.problem}{when}"
 
 
-def sensed(trial: Trial, rig: Rig) -> Trial:
+def remove_faults(trial: Trial, rig: Rig) -> Trial:
     """The trial without faulty readings; faults are named in `faults` and `warnings`."""
     channels = {name: values.copy() for name, values in trial.channels.items()}
-    found, kinds, steps = _missing(trial), _kinds(trial, rig), np.diff(trial.t)
+    found, kinds, steps = _find_gaps(trial), _group_channels(trial, rig), np.diff(trial.t)
     wide = np.flatnonzero(steps > max(PAUSE, USUAL * float(np.quantile(steps, 0.95))))
     usual = f"rows are {float(np.median(steps)):.2g} s apart: rows are missing, or the clock was set"
     found += [Fault("t", f"jumps by {steps[i]:.3g} s at {trial.t[i]:.2f} s, where {usual}")
               for i in wide[:LISTED]]  # fmt: skip
     for names, _ in kinds:
         for name in names:
-            found += _far_off(name, trial.t, channels[name])
+            found += _remove_outliers(name, trial.t, channels[name])
     seen = {name: values.copy() for name, values in channels.items()}
     rates = dict(position_pairs(trial))
     for names, noise in kinds:
         for name in names:
-            fault, stuck = _repeated(name, trial.t, seen, names, noise, rates.get(name))
+            fault, stuck = _find_repeats(name, trial.t, seen, names, noise, rates.get(name))
             channels[name][stuck] = np.nan
             found += [] if fault is None else [fault]
-    still = [rate for rate in rates.values() if _reach(seen[rate]) == 0]
+    still = [rate for rate in rates.values() if _range(seen[rate]) == 0]
     if still and len(still) == len(rates) and not all(_rests(seen[name]) for name in rates):
         found.append(Fault(", ".join(still), "stand still though positions move, and are left out"))
         channels |= {rate: np.full(trial.t.size, np.nan) for rate in still}
-    found += _leaps(trial.t, channels, rates)
+    found += _remove_leaps(trial.t, channels, rates)
     trial = replace(trial, channels=channels)
     lines = tuple(f"{trial.file}: {fault.line}" for fault in found)
     return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
 
 
-def _kinds(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
+def _group_channels(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
     """Channels grouped by quantity, as each is compared with its fellows, and the noise stated by the rig."""
     noise = rig.noise
     if rig.gripper is not None:
@@ -179,7 +181,7 @@ def _kinds(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
     return [(names, sd) for names, sd in there if names]
 
 
-def _far_off(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
+def _remove_outliers(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
     """The few readings far beyond the range of all others, which are set to NaN in `values`."""
     there = np.flatnonzero(np.isfinite(values))
     few = max(1, int(FEW * there.size))
@@ -197,7 +199,7 @@ def _far_off(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
     return [Fault(name, problem, tuple((float(t[i]), float(t[i])) for i in wild))]
 
 
-def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: list[str],
+def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: list[str],
               stated: float | None, rate: str | None) -> tuple[Fault | None, np.ndarray]:  # fmt: skip
     """Runs of one value that a working sensor cannot have read, and their samples (num_timesteps,).
 
@@ -219,7 +221,7 @@ def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: li
             continue
         chance = _chance_of_repeat(name, value, at, seen, fellows, stated)
         unlikely = _unlikely(stop - start, chance, shown.size)
-        if unlikely or (rate is not None and _swept(at, t, values, seen[rate])):
+        if unlikely or (rate is not None and _is_swept(at, t, values, seen[rate])):
             stuck[at] = True
             standing.setdefault(value, []).append((float(t[at[0]]), float(t[at[-1]])))
     if not standing:
@@ -235,7 +237,7 @@ def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: li
     return Fault(name, f"{problem}, and is left out", every), stuck
 
 
-def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
+def _is_swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
     """Whether a live velocity carries a position far while the position repeats itself (samples `at`)."""
     known = rate[at][np.isfinite(rate[at])]
     if known.size < MIN_ALIVE // 3 or _rests(rate, at):
@@ -243,7 +245,7 @@ def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) 
     v, steps = np.nan_to_num(rate[at]), np.diff(t[at])
     way = float(np.ptp(np.cumsum(steps * (v[1:] + v[:-1]) / 2)))
     by_noise = white_sd(known, 1) * float(np.median(steps)) * np.sqrt(steps.size)
-    return bool(way > max(SWEPT * _reach(values), SURE * by_noise))
+    return bool(way > max(SWEPT * _range(values), SURE * by_noise))
 
 
 def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
@@ -257,7 +259,7 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if not _rests(v)]
     waits = all(_rests(v, at) for v in others)
     scatter = whiteness(alive) <= SCATTERS or (stated is not None and not waits)
-    if not any(_reach(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
+    if not any(_range(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
         return 1.0
     differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
     pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
@@ -273,16 +275,16 @@ def _rests(values: np.ndarray, at: np.ndarray | slice = slice(None)) -> bool:
     """Whether (a stretch of) a channel mostly repeats itself, up to rounding."""
     stretch = values[at]
     steps = np.diff(stretch[np.isfinite(stretch)])
-    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * _reach(values)) > 0.5)
+    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * _range(values)) > 0.5)
 
 
-def _reach(values: np.ndarray) -> float:
+def _range(values: np.ndarray) -> float:
     """Range of a channel's readings, 0 of none."""
     there = values[np.isfinite(values)]
     return float(np.ptp(there)) if there.size else 0.0
 
 
-def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
+def _remove_leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
     """A single position that steps as its velocity does not; the samples in doubt are set to NaN.
 
     If several positions step, the hand does (backlash).
@@ -316,7 +318,7 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
     return [Fault(name, problem + why, ((float(t[first]), float(t[last])),))]
 
 
-def _missing(trial: Trial) -> list[Fault]:
+def _find_gaps(trial: Trial) -> list[Fault]:
     """Channels with few readings or long gaps, and rows that are hardly ever complete."""
     gone = {name: ~np.isfinite(values) for name, values in trial.channels.items()}
     out = []

@@ -268,7 +268,7 @@ def with_heights(signals: Signals, trial: Trial, rig: Rig) -> Signals:
     return replace(signals, y1=whole.y1, y2=whole.y2, sd_y=whole.sd_y)
 
 
-def levelled(trial: Trial) -> Trial:
+def remove_roll(trial: Trial) -> Trial:
     """A Cartesian trial as it would have been recorded had the hand not rolled.
 
     InputError for a roll at which no hand holds an upright block.

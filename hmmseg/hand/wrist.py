@@ -164,7 +164,7 @@ class Held:
     lifts: list[float]
 
 
-def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None
+def find_grips(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None
             ) -> Held:  # fmt: skip
     """Grips of the opening (num_timesteps,) [m]; `pressing` as from `grip_force_of`."""
     held = closings(opening)
@@ -186,7 +186,7 @@ def contradiction(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, held:
     axes that are exchanged or reversed leave that noise unchanged.
     """
     try:
-        flipped = held_by(trial, rig, pose, -opening, None)
+        flipped = find_grips(trial, rig, pose, -opening, None)
     except InputError:
         flipped = None
     if flipped is not None and _lifts_all(flipped.loads) and flipped.tool.noise < held.tool.noise:
@@ -229,18 +229,18 @@ def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None
 
     None if the hand does not move, which leaves nothing to judge by.
     """
-    raised, moved = _raised(grip, pose), went(grip.start, grip.stop, pose)
+    raised, moved = _raised(grip, pose), has_moved(grip.start, grip.stop, pose)
     lifted, force = bool(raised.any()), force[grip.start : grip.stop]
-    load = borne(force[raised] @ pose.up if lifted else force[moved] @ pose.across, pose, tool)
+    load = median_load(force[raised] @ pose.up if lifted else force[moved] @ pose.across, pose, tool)
     return load if lifted or load is None else abs(load)
 
 
-def went(start: int, stop: int, pose: Pose) -> np.ndarray:
+def has_moved(start: int, stop: int, pose: Pose) -> np.ndarray:
     """Samples from `start` to `stop` in which the hand has left its place at the start."""
     return np.linalg.norm(pose.position[start:stop] - pose.position[start], axis=1) > MOVED
 
 
-def borne(load: np.ndarray, pose: Pose, tool: Tool) -> float | None:
+def median_load(load: np.ndarray, pose: Pose, tool: Tool) -> float | None:
     """Median of a load (num_samples,) [N], 0 if within its noise; None of too few samples.
 
     Samples within one smoothing window are not independent.
@@ -256,12 +256,13 @@ def borne(load: np.ndarray, pose: Pose, tool: Tool) -> float | None:
 
 def bears(start: int, stop: int, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
     """Load [N] of a grip that still lasts; None until the hand has moved for long enough."""
-    gone, height = went(start, stop, pose), pose.position[start:stop] @ pose.up
+    gone, height = has_moved(start, stop, pose), pose.position[start:stop] @ pose.up
     gone &= np.isfinite(force[start:stop]).all(axis=1)
     if gone.sum() * float(np.median(np.diff(pose.t))) < WENT * pose.window:
         return None
     raised = height[gone] - height[0] > MOVED
-    up, aside = (borne(force[start:stop][gone] @ way, pose, tool) or 0.0 for way in (pose.up, pose.across))
+    moving = force[start:stop][gone]
+    up, aside = (median_load(moving @ way, pose, tool) or 0.0 for way in (pose.up, pose.across))
     return up if raised.mean() > 0.5 else max(abs(up), abs(aside))
 
 
@@ -283,7 +284,7 @@ HALVES = (
 )
 
 
-def halved(trial: Trial) -> bool:
+def is_halved(trial: Trial) -> bool:
     """Whether the fingers' forces are halves of one wrist sensor's: two fingertips never feel the same."""
     pairs = [("fx1", "fx2"), ("fy1", "fy2")]
     if not all(name in trial.channels for pair in pairs for name in pair):
@@ -292,7 +293,7 @@ def halved(trial: Trial) -> bool:
     return all(same) and any(np.ptp(trial.channels[a][np.isfinite(trial.channels[a])]) > 0 for a, _ in pairs)
 
 
-def from_halves(trial: Trial, rig: Rig) -> Trial:
+def join_halves(trial: Trial, rig: Rig) -> Trial:
     """The two fingers of a trial whose forces are halves of a wrist's, read as that of a gripper."""
     c = trial.channels
     channels = {
@@ -313,14 +314,14 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     pose = pose_of(trial, gripper)
     opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
     pressing = grip_force_of(trial.channels, gripper)
-    held = held_by(trial, rig, pose, opening, pressing)
+    held = find_grips(trial, rig, pose, opening, pressing)
     signs: tuple[str, ...] = ()
     if held.lifts and max(held.lifts) < 0:
         # Lifted objects weigh on the hand, which shows the sign more surely than the hand's own inertia.
         least = min(held.lifts)
         for reaction in (True, False) if gripper.reaction is None else ():
             other = rig.model_copy(update={"gripper": gripper.model_copy(update={"reaction": reaction})})
-            found = held_by(trial, other, pose, opening, pressing)
+            found = find_grips(trial, other, pose, opening, pressing)
             if found.lifts and max(found.lifts) > 0:
                 held, rig, signs = found, other, (pose_remark(trial, other, max(found.lifts)),)
                 break

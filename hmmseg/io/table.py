@@ -46,7 +46,7 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def plain_table(
+def make_table(
     file: str, columns: dict[str, np.ndarray], rest: Sequence[str] = (), wanted: Sequence[str] | None = None
 ) -> Table:
     """A table whose rows count from 1, as many as most columns have; `rest`: columns that were not read."""
@@ -80,7 +80,7 @@ def check_unique(names: Sequence[str], where: str) -> None:
             raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
 
 
-def appended(table: Table, more: Table) -> Table:
+def append(table: Table, more: Table) -> Table:
     """A table followed by the rows of another with the same columns."""
     columns = {name: np.concatenate([values, more.columns[name]]) for name, values in table.columns.items()}
     return replace(table, columns=columns, rows=np.concatenate([table.rows, more.rows]))
@@ -177,7 +177,7 @@ def frame_table(source: Any, wanted: Sequence[str] | None) -> Table:
     check_unique(names, where)
     kept = {name: _array(values) for name, (_, values) in zip(names, named, strict=True)
             if is_wanted(name, wanted)}  # fmt: skip
-    return plain_table(where, kept, [name for name in names if name not in kept])
+    return make_table(where, kept, [name for name in names if name not in kept])
 
 
 def _array(values: Any) -> np.ndarray:

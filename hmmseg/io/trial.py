@@ -136,7 +136,7 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
         theirs = source_of(name, columns)
         if theirs not in table.columns:
             continue
-        values = _mapped(numbers(table, theirs), name, columns, table)
+        values = _to_si(numbers(table, theirs), name, columns, table)
         beyond = np.flatnonzero(np.abs(np.nan_to_num(values)) > LARGEST)
         if task is None and beyond.size:
             raise InputError(f"{table.file}: row {table.rows[beyond[0]]}, column {theirs}",
@@ -160,7 +160,7 @@ def mapped_times(table: Table, rig: Rig | None) -> tuple[np.ndarray, int | None]
     if name not in table.columns:
         raise InputError(f"{table.file}: column {name}", "missing", f"a column of times in s, {MAPPED}")
     stamps, origin = times(table, name)
-    t = _mapped(stamps, "t", columns, table)
+    t = _to_si(stamps, "t", columns, table)
     _check_times(t, table)
     return t, origin
 
@@ -202,7 +202,7 @@ def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, 
         raise InputError(where, "has no columns but t", "at least one channel")
 
 
-def _mapped(values: np.ndarray, ours: str, columns: Mapping[str, Column], table: Table) -> np.ndarray:
+def _to_si(values: np.ndarray, ours: str, columns: Mapping[str, Column], table: Table) -> np.ndarray:
     """Values in SI, by the unit of the mapping or else the one that the file states."""
     entry = columns.get(ours, Column())
     unit = entry.unit if entry.unit is not None else table.units.get(source_of(ours, columns), 1.0)

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.special import softmax
 
 from hmmseg.sequence.emissions import FLOORS, Learner
-from hmmseg.sequence.features import filled
+from hmmseg.sequence.features import fill_gaps
 
 MAX_BLOCKS = 250  # numerics: the cost table is quadratic in this
 
@@ -136,7 +136,7 @@ def _learn_course(
     temper = 1 / features  # during EM a cell counts as one observation
     cells = len(values[teacher])
     cuts = np.unique(np.clip((known[np.isfinite(known)] * cells).round().astype(int), 1, cells - 1))
-    path = partition(np.arcsinh(filled(values[teacher])), number, floor, cuts)
+    path = partition(np.arcsinh(fill_gaps(values[teacher])), number, floor, cuts)
     alone = Learner([values[teacher]], names, [False] * number)
     initial, start = alone.run([np.eye(number)[path]], temper, FLOORS[1:3], steps=1)
     paths = [path if cuts.size and i == teacher else None for i in range(len(values))]
@@ -145,7 +145,7 @@ def _learn_course(
     emissions, probability = learner.run([a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
     paths = [p.argmax(1) for p in probability]
-    one_hot, stacked = np.eye(number)[np.concatenate(paths)], np.vstack([filled(v) for v in values])
+    one_hot, stacked = np.eye(number)[np.concatenate(paths)], np.vstack([fill_gaps(v) for v in values])
     x = np.arcsinh(stacked)
     cost = pooled_costs(one_hot.sum(0), one_hot.T @ x, one_hot.T @ x**2, MERGE_FLOOR) / features
     share = learner.tempered(emissions, probability).temper * features
@@ -158,7 +158,7 @@ def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int,
     By `share` independent observations per cell: each side has its own mean and variance per channel (Schwarz
     criterion), and the change is equally likely between any two cells of a trial.
     """
-    bridged = [np.arcsinh(filled(v)) for v in values]
+    bridged = [np.arcsinh(fill_gaps(v)) for v in values]
     stacked, path = np.vstack(bridged), np.concatenate(paths)
     features = stacked.shape[1]
     out = np.zeros(number - 1)
@@ -180,7 +180,7 @@ def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int,
     return out
 
 
-def coarse(values: np.ndarray, factor: int) -> np.ndarray:
+def coarsen(values: np.ndarray, factor: int) -> np.ndarray:
     """Means over `factor` neighbouring cells (NaN if none has a value)."""
     known = np.isfinite(values)
     starts = np.arange(0, len(values), factor)

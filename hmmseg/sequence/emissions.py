@@ -189,7 +189,7 @@ def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence
     return left_to_right(np.maximum(mean_cells, LEAST_CELLS), there)
 
 
-def detecting(chain: Chain, crossing: np.ndarray) -> Chain:
+def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
     """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary added.
 
     A path that skips a state crosses both its boundaries.
@@ -241,7 +241,7 @@ class Learner:
               detectors: Detectors | None = None) -> list[AlignmentPosterior]:  # fmt: skip
         """Posterior alignments of all trials, within what labels allow."""
         tables, chains = zip(
-            *(weighed(values, emissions, law, detectors) for values in self.values), strict=True
+            *(weigh(values, emissions, law, detectors) for values in self.values), strict=True
         )
         tables = [ll if free is None else ll + free for ll, free in zip(tables, self.allowed, strict=True)]
         return align(tables, chains)
@@ -271,13 +271,13 @@ class Learner:
         return replace(emissions, temper=independent_share(residuals))
 
 
-def weighed(values: np.ndarray, emissions: StudentEmissions, law: Chain,
+def weigh(values: np.ndarray, emissions: StudentEmissions, law: Chain,
             detectors: Detectors | None) -> tuple[np.ndarray, Chain]:  # fmt: skip
     """Log-likelihoods (num_cells, num_states) of a trial, and its chain."""
     ll = emissions.log_likelihoods(values)
     if detectors is None:
         return ll, law
-    return detectors.state_weight * ll, detecting(law, detectors.crossing(values))
+    return detectors.state_weight * ll, add_detectors(law, detectors.crossing(values))
 
 
 def durations(probability: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

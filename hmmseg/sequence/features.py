@@ -51,7 +51,7 @@ class SequenceFeatures:
         return (boundaries - self.edges[0]) / (self.edges[-1] - self.edges[0])
 
 
-def without_old(values: np.ndarray) -> np.ndarray:
+def drop_repeats(values: np.ndarray) -> np.ndarray:
     """A channel (num_timesteps,) without repeated readings (NaN) if it is sampled at a lower rate than rows.
 
     That is so where no two consecutive samples both change: each repeats the last reading.
@@ -77,7 +77,7 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
     cell = np.minimum(((trial.t - start) / step).astype(int), num_cells - 1)
     means = np.full((num_cells, len(channels)), np.nan)
     for j, name in enumerate(channels):
-        x = without_old(trial.channels[name])
+        x = drop_repeats(trial.channels[name])
         finite = np.isfinite(x)
         count = np.bincount(cell[finite], minlength=num_cells)
         total = np.bincount(cell[finite], x[finite], minlength=num_cells)
@@ -85,7 +85,7 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
     return start + step * np.arange(num_cells + 1), means
 
 
-def filled(x: np.ndarray) -> np.ndarray:
+def fill_gaps(x: np.ndarray) -> np.ndarray:
     """Missing cells interpolated linearly (held at the ends), column by column."""
     out = np.zeros_like(x)
     index = np.arange(len(x))
@@ -118,7 +118,7 @@ def edge_preserving_slopes(x: np.ndarray, window: int) -> np.ndarray:
 
 
 def _raw(means: np.ndarray, step: float, window: int) -> np.ndarray:
-    slopes = edge_preserving_slopes(filled(means), window) / step
+    slopes = edge_preserving_slopes(fill_gaps(means), window) / step
     return np.hstack([means, np.where(np.isfinite(means), slopes, np.nan)])
 
 

@@ -21,7 +21,7 @@ from hmmseg.sequence.courses import (
     Course,
     Naming,
     best_choice,
-    coarse,
+    coarsen,
     find_courses,
     naming,
     probabilities,
@@ -32,7 +32,7 @@ from hmmseg.sequence.emissions import (
     Detectors,
     Learner,
     StudentEmissions,
-    detecting,
+    add_detectors,
     durations,
     learn,
 )
@@ -92,11 +92,11 @@ def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> 
         raise InputError("labels", f"none is for these trials (there are {', '.join(sorted(labels))})",
                          f"names such as {stems[0]}")  # fmt: skip
     unknown = np.full(len(task.sequence) - 1, np.nan)
-    return [unknown if each is None else _checked(each, trial, task)
+    return [unknown if each is None else _check_labels(each, trial, task)
             for each, trial in zip(given, trials, strict=True)]  # fmt: skip
 
 
-def _checked(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
+def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     where, names = f"labels of {trial.file}", task.sequence[1:]
     if isinstance(given, Mapping):
         for name in given:
@@ -130,7 +130,7 @@ def _checked(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     return boundaries
 
 
-def forbidden(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
+def label_constraints(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
     """Log weights (num_cells, num_states) that keep labelled boundaries [s] within a cell; None without any.
 
     -inf where a label forbids a state, 0 elsewhere.
@@ -173,7 +173,7 @@ def choose_detectors(taught: Learner, data: Sequence[SequenceFeatures], boundari
             detectors = learn([channels[j] for j in rest], [shown[j] for j in rest], half)
             ratios = detectors.log_ratios(channels[i])
             tables += [state_weight * lls[i] for _, state_weight in grid]
-            chains += [detecting(law, weight * ratios) for weight, _ in grid]
+            chains += [add_detectors(law, weight * ratios) for weight, _ in grid]
         held_out = zip(align(tables, chains), np.repeat(np.arange(len(data)), len(grid)), strict=True)
         scores, excess = zip(*(_held_out_score(a.boundary, cells[i]) for a, i in held_out), strict=True)
         mean = np.reshape(scores, (len(data), -1)).mean(0)
@@ -212,20 +212,20 @@ def _fit_unlabelled(data: list[SequenceFeatures], task: SequenceTask, mapping: F
         return _finish(data, task, mapping, learner, *_converge(learner, start))
     factor = max(1, round(float(np.median([len(v) for v in values])) / COARSE_CELLS))
     known = [each.shares(b) for each, b in zip(data, boundaries, strict=True)]
-    courses = find_courses([coarse(v, factor) for v in values], num_states, known)
+    courses = find_courses([coarsen(v, factor) for v in values], num_states, known)
     namings = [naming(course, num_states, known) for course in courses]
     probability = probabilities(namings)
     choice = best_choice(courses, namings, probability)
     optional = optional_states(task, choice.settled)
-    allowed = [forbidden(d, b, len(optional)) for d, b in zip(data, boundaries, strict=True)]
+    allowed = [label_constraints(d, b, len(optional)) for d, b in zip(data, boundaries, strict=True)]
     learner = Learner(values, task.sequence, optional, allowed=allowed)
     paths = [np.searchsorted(np.array(choice.ends) - 0.5, p.argmax(1))
-             for p in _fine(courses[choice.course], factor, values)]  # fmt: skip
+             for p in _on_fine_grid(courses[choice.course], factor, values)]  # fmt: skip
     start = [np.eye(len(optional))[p] for p in paths]
     model = _finish(data, task, mapping, learner, *_converge(learner, start))
     order = [i for i in np.argsort(-probability) if probability[i] >= LEAST_PROBABLE][:MOST_KEPT]
     total = float(probability[order].sum())
-    named = tuple(_named(values, known, courses[i], namings[i], float(probability[i]) / total, factor)
+    named = tuple(_name_course(values, known, courses[i], namings[i], float(probability[i]) / total, factor)
                   for i in order)  # fmt: skip
     scale = np.where(np.isfinite(boundaries).any(0), WEIGHING.labelled, WEIGHING.lag)
     lag = scale * float(np.median([len(v) for v in values]))
@@ -239,16 +239,16 @@ def _converge(learner: Learner, start: list[np.ndarray]) -> tuple[StudentEmissio
     return emissions, [a.smoothed for a in learner.align(emissions, learner.law(probability))]
 
 
-def _fine(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndarray]:
+def _on_fine_grid(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndarray]:
     """Probabilities [(num_cells, num_stretches), ...] of a course's stretches, on the fine grid."""
     return [np.repeat(p, factor, axis=0)[: len(v)] for p, v in zip(course.probability, values, strict=True)]
 
 
-def _named(values: list[np.ndarray], known: list[np.ndarray], course: Course, found: Naming,
+def _name_course(values: list[np.ndarray], known: list[np.ndarray], course: Course, found: Naming,
            probability: float, factor: int) -> NamedCourse:  # fmt: skip
     """A course on the fine grid, with the mean lag of labels (as shares) behind each of its changes."""
     names = [f"{k}" for k in range(len(course.cost) - 1)]
-    learner, stretches = Learner(values, names, [False] * len(names)), _fine(course, factor, values)
+    learner, stretches = Learner(values, names, [False] * len(names)), _on_fine_grid(course, factor, values)
     emissions = learner.tempered(learner.emissions(stretches, FLOORS[-1], 1.0), stretches)
     mean_cells = np.maximum(np.mean([p.sum(0) for p in stretches], 0), LEAST_CELLS)
     lags = np.array([(b[:, None] - ends) * len(v)
@@ -272,7 +272,7 @@ def _fit_labelled(data: list[SequenceFeatures], task: SequenceTask, mapping: Fea
     law = taught.law(probability)
     mine = [d for d, _, _ in own], [b for _, b, _ in own], [path for _, _, path in own]
     detectors = choose_detectors(taught, *mine, temper=emissions.temper, law=law)
-    allowed = [None if labelled else forbidden(d, b, len(optional))
+    allowed = [None if labelled else label_constraints(d, b, len(optional))
                for d, b, labelled in zip(data, boundaries, whole, strict=True)]  # fmt: skip
     learner = Learner([d.values for d in data], task.sequence, optional, known=paths, allowed=allowed)
     if len(own) < len(data):

@@ -22,7 +22,7 @@ from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
 from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
-from hmmseg.sequence.emissions import LEAST_CELLS, Detectors, StudentEmissions, transitions, weighed
+from hmmseg.sequence.emissions import LEAST_CELLS, Detectors, StudentEmissions, transitions, weigh
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures
 from hmmseg.tables import Tabled, listed
 
@@ -102,7 +102,7 @@ class SequenceModel(Tabled):
     def align(self, trial: SequenceFeatures) -> AlignmentPosterior:
         """Posterior alignment; InfeasibleAlignment for fewer cells than subtasks."""
         law = transitions(self.mean_cells, self.presence, optional_states(self.task, self.settled))
-        ll, chain = weighed(trial.values, self.emissions, law, self.detectors)
+        ll, chain = weigh(trial.values, self.emissions, law, self.detectors)
         return align([ll], [chain])[0]
 
     def misfit(self, trial: SequenceFeatures) -> tuple[np.ndarray, np.ndarray, AlignmentPosterior]:

@@ -41,7 +41,7 @@ class Boundaries:
     gain: np.ndarray
 
 
-def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], lag: np.ndarray) -> Boundaries:
+def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], lag: np.ndarray) -> Boundaries:
     """Mixture over all courses of `crossings` [(num_cells - 1, num_changes), ...], the posterior of each.
 
     `lag` (num_boundaries,) [cells]. The gain is the mutual information of naming and label: the entropy of
@@ -149,7 +149,7 @@ def _segment(trial: Trial, data: SequenceFeatures, model: SequenceModel) -> Segm
 def _posterior(data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior) -> Boundaries:
     """Of all boundaries, from the model's courses where it has any, else from its own alignment."""
     if model.courses:
-        return together([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
+        return mix([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
     crossing = alignment.boundary[:, : len(model.task.sequence) - 1].copy()
     if model.detectors is not None:
         for b in np.flatnonzero(model.detectors.jitter > 0):

@@ -95,14 +95,14 @@ def rows_of(path: Path, kind: str) -> int | None:
 
 def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) -> Iterator[Table]:
     """Tables of about `rows` rows each, in order, none of fewer than `least`; InputError as `read_table`."""
-    from hmmseg.io.table import appended
+    from hmmseg.io.table import append
 
     file, _ = split_part(path)
     waiting: Table | None = None
     with _parsing(path):
         for piece in _module(kind_of(file), path).read_pieces(file, wanted, rows):
             if waiting is not None and len(piece.rows) < least:
-                waiting = appended(waiting, piece)
+                waiting = append(waiting, piece)
                 continue
             if waiting is not None:
                 yield waiting

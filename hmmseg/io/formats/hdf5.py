@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, check_part, flat, is_wanted, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, check_part, flat, is_wanted, make_table
 
 MAX_WIDTH = 64  # numerics: numbers per row; images are no channels
 
@@ -48,7 +48,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         lengths = [len(values) for values in columns.values()]
         lengths = lengths or [each.shape[0] for each in datasets.values()]
         columns = {"t": np.arange(max(lengths, key=lengths.count, default=0)) / rate, **columns}
-    return plain_table(f"{path}#{part}" if part else str(path), columns, rest)
+    return make_table(f"{path}#{part}" if part else str(path), columns, rest)
 
 
 def _datasets(group: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str, h5py.Dataset]]:

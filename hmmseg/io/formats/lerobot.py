@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from hmmseg.errors import InputError
 from hmmseg.io.formats.parquet import to_columns
 from hmmseg.io.schema import read_json
-from hmmseg.io.table import Table, check_part, plain_table
+from hmmseg.io.table import Table, check_part, make_table
 
 EPISODE = "episode_index"
 PERSISTENT, EVENTS = "language_persistent", "language_events"
@@ -60,14 +60,14 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     for file in data_files(path):
         table = pq.read_table(file, filters=[(EPISODE, "==", int(part))])
         if table.num_rows:
-            texts = spoken(table)
+            texts = texts_by_style(table)
             table = table.drop_columns([name for name in (PERSISTENT, EVENTS) if name in table.column_names])
-            columns = _named(to_columns(table), info) | texts
+            columns = _rename_entries(to_columns(table), info) | texts
             break
     else:
         raise InputError(f"{path}#{part}", "has no samples", "an episode")
     rest = [name for name in columns if wanted is not None and name not in wanted]
-    return plain_table(f"{path}#{part}", columns, rest, wanted)
+    return make_table(f"{path}#{part}", columns, rest, wanted)
 
 
 def language_rows(table: pa.Table) -> list[dict[str, Any]]:
@@ -88,7 +88,7 @@ def read_subtasks(folder: Path) -> bool:
     return False
 
 
-def spoken(table: pa.Table) -> dict[str, np.ndarray]:
+def texts_by_style(table: pa.Table) -> dict[str, np.ndarray]:
     """By style, the text (num_timesteps,) that holds at each sample of an episode; None before the first."""
     out: dict[str, np.ndarray] = {}
     rows = language_rows(table)
@@ -136,7 +136,7 @@ def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, 
     return table
 
 
-def _named(columns: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:
+def _rename_entries(columns: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:
     """Columns renamed to the names of the features' entries in info.json."""
     out: dict[str, np.ndarray] = {}
     labels = {}

@@ -64,7 +64,7 @@ class Stream:
         """Keep one message, or the reason why it cannot be decoded."""
         try:
             message = decode()
-            values = dict(_flat(message, self.topic))
+            values = dict(_flatten(message, self.topic))
         except Exception as error:  # decoders raise anything on hostile messages
             self.failed += 1
             self.reason = self.reason or shown(error) or type(error).__name__
@@ -124,7 +124,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
                              "messages of ROS with a known type, or JSON")  # fmt: skip
         which = f"{stream.failed} messages of topic" if stream.values else "topic"
         notes.append(f"{path}: {which} {stream.topic} cannot be decoded ({stream.reason}) and is left out")
-    return joined(str(path), list(streams.values()), wanted, notes)
+    return join_streams(str(path), list(streams.values()), wanted, notes)
 
 
 def _messages(path: Path, notes: list[str]) -> Iterator[Message]:
@@ -134,7 +134,7 @@ def _messages(path: Path, notes: list[str]) -> Iterator[Message]:
             notes.append(f"{path}: has no metadata.yaml: the recording was not finished; all files are read")
         files = sorted(file for end in ("mcap", "db3") for file in path.glob(f"*.{end}"))
         if not files:
-            yield from _packed_bag(path)
+            yield from _compressed_messages(path)
         for file in files:
             yield from _messages(file, notes)
     elif path.suffix.lower() == ".mcap":
@@ -200,7 +200,7 @@ def _db3_messages(path: Path) -> Iterator[Message]:
             yield topic, logged, partial(decode, data)
 
 
-def _packed_bag(folder: Path) -> Iterator[Message]:
+def _compressed_messages(folder: Path) -> Iterator[Message]:
     """Messages of a ROS 2 bag whose files are compressed."""
     from rosbags.rosbag2 import Reader
 
@@ -222,10 +222,10 @@ def _bag_messages(file: BufferedIOBase, path: Path, notes: list[str]) -> Iterato
             notes.append(
                 f"{path}: has no index: the recording was not finished; it is read as far as it goes"
             )
-        inside = [(head, data)] if kind != b"\x05" else _records(_unpacked(head, data))
+        inside = [(head, data)] if kind != b"\x05" else _records(_decompress(head, data))
         for inner, content in inside:
             if inner[b"op"] == b"\x07":
-                declared = _fields(content)
+                declared = _parse_fields(content)
                 kind_name = declared[b"type"].decode().replace("/", "/msg/")
                 decoder = _Decoder(kind_name, "ros1", declared[b"message_definition"].decode())
                 topics[inner[b"conn"]] = inner[b"topic"].decode(), decoder
@@ -237,18 +237,18 @@ def _bag_messages(file: BufferedIOBase, path: Path, notes: list[str]) -> Iterato
 
 def _records(file: BufferedIOBase) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
     while size := file.read(4):
-        head = _fields(_exactly(file, int.from_bytes(size, "little")))
-        yield head, _exactly(file, int.from_bytes(_exactly(file, 4), "little"))
+        head = _parse_fields(_read_exactly(file, int.from_bytes(size, "little")))
+        yield head, _read_exactly(file, int.from_bytes(_read_exactly(file, 4), "little"))
 
 
-def _exactly(file: BufferedIOBase, size: int) -> bytes:
+def _read_exactly(file: BufferedIOBase, size: int) -> bytes:
     data = file.read(size)  # allocates no more than the file has
     if len(data) < size:
         raise EOFError("the file ends within a record")
     return data
 
 
-def _fields(data: bytes) -> dict[bytes, bytes]:
+def _parse_fields(data: bytes) -> dict[bytes, bytes]:
     out, at = {}, 0
     while at < len(data):
         end = at + 4 + int.from_bytes(data[at : at + 4], "little")
@@ -257,7 +257,7 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
     return out
 
 
-def _unpacked(head: dict[bytes, bytes], data: bytes) -> BufferedIOBase:
+def _decompress(head: dict[bytes, bytes], data: bytes) -> BufferedIOBase:
     how, size = head[b"compression"], int.from_bytes(head[b"size"], "little")
     if size > MAX_CHUNK:
         raise ValueError(f"a chunk claims {size} bytes")
@@ -303,7 +303,7 @@ def topic_wanted(topic: str, wanted: Sequence[str] | None) -> bool:
     return wanted is None or any(each.startswith((f"{topic}.", f"{topic}[")) for each in wanted)
 
 
-def joined(
+def join_streams(
     file: str, streams: Sequence[Stream], wanted: Sequence[str] | None, notes: Sequence[str] = ()
 ) -> Table:
     """One table of all wanted columns, on the times of the fastest of them."""
@@ -397,7 +397,7 @@ def _members(message: Any) -> Iterator[tuple[str, Any]] | None:
     return None
 
 
-def _flat(message: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, float]]:
+def _flatten(message: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, float]]:
     if isinstance(message, bool | str | bytes) or message is None or depth > 12:
         return
     if isinstance(message, int | float | np.number):
@@ -406,7 +406,7 @@ def _flat(message: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, floa
     if isinstance(message, list | tuple | np.ndarray):
         if 0 < len(message) <= MAX_ENTRIES:
             for i, entry in enumerate(message):
-                yield from _flat(entry, f"{prefix}[{i}]", depth + 1)
+                yield from _flatten(entry, f"{prefix}[{i}]", depth + 1)
         return
     members = _members(message)
     if members is None:
@@ -419,6 +419,6 @@ def _flat(message: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, floa
             continue
         if labels and isinstance(value, list | tuple | np.ndarray) and len(value) == len(labels):
             for label, entry in zip(labels, value, strict=True):
-                yield from _flat(entry, f"{prefix}.{name}.{label}", depth + 1)
+                yield from _flatten(entry, f"{prefix}.{name}.{label}", depth + 1)
         else:
-            yield from _flat(value, f"{prefix}.{name}", depth + 1)
+            yield from _flatten(value, f"{prefix}.{name}", depth + 1)

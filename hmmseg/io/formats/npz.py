@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, is_wanted, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, is_wanted, make_table
 
 MAX_MEMBER = 16 * MAX_ROWS  # bytes of one array
 MAX_ARCHIVE = 8 * MAX_MEMBER  # bytes of all that are read
@@ -34,7 +34,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         file.seek(0)
         arrays = np.load(file, allow_pickle=False)
         columns = {name: arrays[name] for name in chosen}
-    return plain_table(str(path), columns, [name for name in names if name not in chosen], wanted)
+    return make_table(str(path), columns, [name for name in names if name not in chosen], wanted)
 
 
 def num_rows(path: Path) -> int | None:

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, check_unique, flat, is_wanted, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, check_unique, flat, is_wanted, make_table
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
@@ -22,7 +22,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         check_unique(names, str(path))
         columns = to_columns(file.read(columns=[name for name in names if is_wanted(name, wanted)]))
     rest = [name for name in names if not any(c == name or c.startswith(f"{name}[") for c in columns)]
-    return plain_table(str(path), columns, rest, wanted)
+    return make_table(str(path), columns, rest, wanted)
 
 
 def num_rows(path: Path) -> int:
