@@ -22,7 +22,7 @@ from scipy.special import ndtri
 
 from experiments.saving import save
 from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
-from experiments.table_text import load, markdown, milliseconds, percent
+from experiments.table_text import markdown, milliseconds, percent
 from experiments.worlds import WORLDS, Replicate, replicates
 from hmmseg.segmentation.spans import Segmentation
 
@@ -173,11 +173,8 @@ def cells(name: str, s: dict[str, Any]) -> list[str]:
     return [name, trials, *rms, *cover[:2], needed[0], cover[2], needed[1], median]
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/tables/worlds.csv and its figure; `needed`: the factor at which intervals hold as stated."""
-    found = load("calibration_worlds")
-    if found is None:
-        return None
     draw(found["rows"], FIGURE)
     return markdown(HEAD, [cells(name, s) for name, s in found["rows"].items()])
 

@@ -26,7 +26,7 @@ from estimation.design import PROPERTIES, Design, Nuisance, Unknown
 from estimation.posterior import posterior
 from estimation.sampler import sample
 from experiments.saving import save
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "sbc.json"
@@ -125,11 +125,8 @@ def ranked(first: int, num: int) -> list[dict[str, Any]]:
     return out
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/tables/sbc.csv: ranks of drawn data sets."""
-    found = load("sbc")
-    if found is None:
-        return None
     rows = [[prop, f"{s['count']}", f"{s['p_value']:.2f}", percent(s["coverage_68"], 1),
              percent(s["coverage_95"], 1)] for prop, s in found["properties"].items()]  # fmt: skip
     return markdown(["property", "data sets", "p of uniform ranks", "68 % cover", "95 % cover"], rows)

@@ -23,7 +23,7 @@ import numpy as np
 from experiments.real import hiro_snap
 from experiments.saving import save
 from experiments.sequence_worlds import World, abrupt, draw
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation, most_telling
@@ -207,11 +207,8 @@ def check(cases: list[Case]) -> dict:
     return {"groups": groups, "cases": each}
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """A row for each group of cases and what was known; draws the figure."""
-    found = load("sequences")
-    if found is None:
-        return None
     rows = []
     for group, entry in found["groups"].items():
         for key, label in ROWS.items():
