@@ -25,7 +25,7 @@ from estimation import priors
 from estimation.design import PROPERTIES, Design, Nuisance, Unknown
 from estimation.posterior import posterior
 from estimation.sampler import sample
-from experiments.saving import save
+from experiments.saving import panels, save
 from experiments.table_text import markdown, percent
 
 HERE = Path(__file__).parent
@@ -160,23 +160,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def draw(document: dict[str, Any], path: Path) -> None:
     """Rank histograms with the band that holds all bins of a uniform one in 99 % of figures."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(9, 2.4), sharey=True, layout="constrained")
-    for ax, (prop, s) in zip(axes, document["properties"].items(), strict=True):
-        level = 1 - 0.99 ** (1 / (3 * BINS))  # all bins of all panels together
-        low, high = stats.binom.ppf([level / 2, 1 - level / 2], s["count"], 1 / BINS)
-        ax.axhspan(low, high, color="0.88", lw=0)
-        ax.stairs(s["bins"], np.linspace(0, 1, BINS + 1), fill=True, alpha=0.7)
-        ax.set_title(f"{prop}, p {s['p_value']:.2f}", fontsize=9)
-        ax.set_xlabel("rank of the true value", fontsize=8)
-    axes[0].set_ylabel("data sets", fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with panels(path, 1, 3, figsize=(9, 2.4), sharey=True) as axes:
+        for ax, (prop, s) in zip(axes, document["properties"].items(), strict=True):
+            level = 1 - 0.99 ** (1 / (3 * BINS))  # all bins of all panels together
+            low, high = stats.binom.ppf([level / 2, 1 - level / 2], s["count"], 1 / BINS)
+            ax.axhspan(low, high, color="0.88", lw=0)
+            ax.stairs(s["bins"], np.linspace(0, 1, BINS + 1), fill=True, alpha=0.7)
+            ax.set_title(f"{prop}, p {s['p_value']:.2f}", fontsize=9)
+            ax.set_xlabel("rank of the true value", fontsize=8)
+        axes[0].set_ylabel("data sets", fontsize=8)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,15 @@ GOALS = {
 }
 
 
+def _share(one: dict[str, Any]) -> list[str]:
+    """Two cells of a proportion: its count, and its percentage with the 90 % interval."""
+    low, high = (100 * v for v in one["interval_90"])
+    return [
+        f"{one['hits']} of {one['of']}",
+        f"{100 * one['hits'] / one['of']:.0f} % ({low:.0f} to {high:.0f})",
+    ]
+
+
 def minute(found: dict) -> str:
     """How long a minute of an arm takes."""
     whole = found["whole"]
@@ -38,9 +47,7 @@ def check(found: dict) -> str:
         one = shares[key]
         if not one["of"]:
             continue
-        low, high = (100 * v for v in one["interval_90"])
-        share = f"{100 * one['share']:.0f} % ({low:.0f} to {high:.0f})"
-        rows.append([label, f"{one['hits']} of {one['of']}", share, goal])
+        rows.append([label, *_share(one), goal])
     seconds = ", ".join(f"{robot} {s:.0f} s" for robot, s in found["processor_seconds"].items())
     cases = [c["robot"] for c in found["each"]]
     counts = ", ".join(f"{robot} {cases.count(robot)}" for robot in found["robots"])
@@ -55,11 +62,7 @@ def check(found: dict) -> str:
 
 def changed(found: dict) -> str:
     """What changed of a servo."""
-    rows = []
-    for one in found["figures"]:
-        low, high = (100 * v for v in one["interval_90"])
-        share = f"{100 * one['hits'] / one['of']:.0f} % ({low:.0f} to {high:.0f})"
-        rows.append([one["figure"], f"{one['hits']} of {one['of']}", share, one["goal"]])
+    rows = [[one["figure"], *_share(one), one["goal"]] for one in found["figures"]]
     seconds = sorted(c["seconds"] for c in found["cases"])
     note = (
         f"{len(found['cases'])} cases, {found['drawn']} of a kind at most, of part `{found['part']}` of the "
