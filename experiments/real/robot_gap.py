@@ -25,9 +25,11 @@ from simgap.robots.diagnose import RobotDiagnosis, diagnose
 from simgap.simulators.recording import read_recording
 from simgap.simulators.user import load_simulator
 
-HERE = Path(__file__).resolve().parent RESULT = HERE.parent / "results" / "xl330.json" SIMULATOR, LOGS =
-"xl330.py:Pendulum", "xl330_*.csv" KEPT = ("verdict", "causes", "indistinguishable", "detection", "effects",
-"fitted", "discrepancy", "shrinkage", "identifiability", "next_experiment")  # fmt: skip
+HERE = Path(__file__).resolve().parent
+RESULT = HERE.parent / "results" / "xl330.json"
+SIMULATOR, LOGS = "xl330.py:Pendulum", "xl330_*.csv"
+KEPT = ("verdict", "causes", "indistinguishable", "detection", "effects", "fitted", "discrepancy",
+        "shrinkage", "identifiability", "next_experiment")  # fmt: skip
 
 
 def summary(found: RobotDiagnosis) -> dict:
