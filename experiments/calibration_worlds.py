@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from experiments.saving import save
+from experiments.saving import panels, save
 from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
-from experiments.table_text import load, markdown, milliseconds, percent
+from experiments.table_text import markdown, milliseconds, percent
 from experiments.worlds import WORLDS, Replicate, replicates
 from hmmseg.segmentation.spans import Segmentation
 
@@ -45,23 +45,18 @@ def score(found: Replicate, seed: int = 0) -> dict[str, Any]:
 
     began = time.process_time()
     said = identify(found.trials, found.task, found.rig, seed)
-    properties = []
-    for obj, block in found.blocks.items():
-        for prop in ("weight", "width", "height"):
-            if (obj, prop) not in said.names:
-                continue
-            draws, true = said.of(obj, prop), getattr(block, prop)
-            properties.append({
-                "of": f"{obj}.{prop}", "share": float(draws.mean() / true - 1),
-                "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
-            })  # fmt: skip
+    known = [
+        (f"{obj}.{prop}", said.of(obj, prop), getattr(block, prop))
+        for obj, block in found.blocks.items() for prop in PROPERTIES if (obj, prop) in said.names
+    ]  # fmt: skip
     for i, unknown in enumerate(said.combinations):
         true = sum(c * found.blocks[obj].height for obj, c in unknown.terms.items())
-        draws = said.combined[:, i]
-        properties.append({
-            "of": ".".join(unknown.name), "share": float(draws.mean() / true - 1),
-            "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
-        })  # fmt: skip
+        known.append((".".join(unknown.name), said.combined[:, i], true))
+    properties = [
+        {"of": name, "share": float(draws.mean() / true - 1), "z": float((draws.mean() - true) / draws.std()),
+         "rank": float((draws < true).mean())}
+        for name, draws, true in known
+    ]  # fmt: skip
     pairs = [(s, b) for s, b in zip(said.segmentations, found.boundaries, strict=True) if s.complete]
     residual = [r for s, b in pairs for r in boundary_residuals(s, b)]
     held = [r for s, b in pairs for r in boundaries_covered(s, b)]
@@ -96,7 +91,7 @@ def summary(scored: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for level in LEVELS:
         inside = [np.abs(r - 0.5) < level / 2 for r in ranks]
         out[f"coverage_{100 * level:.0f}"], out[f"se_{100 * level:.0f}"] = clustered(inside)
-    for prop in ("weight", "width", "height"):
+    for prop in PROPERTIES:
         mine = [p for s in scored for p in s["properties"] if p["of"].endswith(prop)]
         if mine:
             out[prop] = {
@@ -130,32 +125,24 @@ def clustered(inside: Sequence[np.ndarray]) -> tuple[float | None, float | None]
 
 def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
     """A panel for each level, a line for each world; grey is what is to be reached."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(10, 0.26 * len(rows) + 1.2), sharey=True, layout="constrained")
-    names = list(rows)
-    for ax, (key, title, (low, high)) in zip(axes, PANELS, strict=True):
-        ax.axvspan(low, high, color="0.88", lw=0)
-        for y, name in enumerate(names):
-            share, error = rows[name][f"coverage_{key}"], rows[name][f"se_{key}"]
-            if share is None:
-                continue
-            inside = low - 200 * error <= 100 * share <= high + 200 * error
-            ax.errorbar(100 * share, y, xerr=100 * error, fmt="o", ms=3.5, lw=1,
-                        color="C0" if inside else "C3")  # fmt: skip
-        ax.set_title(title, fontsize=9)
-        ax.set_xlim(30 if key == "68" else 55, 101)
-        ax.tick_params(labelsize=8)
-        ax.set_xlabel("true values inside [%]", fontsize=8)
-        ax.grid(axis="x", lw=0.3)
-    axes[0].set_yticks(range(len(names)), names)
-    axes[0].invert_yaxis()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with panels(path, 1, 3, figsize=(10, 0.26 * len(rows) + 1.2), sharey=True) as axes:
+        names = list(rows)
+        for ax, (key, title, (low, high)) in zip(axes, PANELS, strict=True):
+            ax.axvspan(low, high, color="0.88", lw=0)
+            for y, name in enumerate(names):
+                share, error = rows[name][f"coverage_{key}"], rows[name][f"se_{key}"]
+                if share is None:
+                    continue
+                inside = low - 200 * error <= 100 * share <= high + 200 * error
+                ax.errorbar(100 * share, y, xerr=100 * error, fmt="o", ms=3.5, lw=1,
+                            color="C0" if inside else "C3")  # fmt: skip
+            ax.set_title(title, fontsize=9)
+            ax.set_xlim(30 if key == "68" else 55, 101)
+            ax.tick_params(labelsize=8)
+            ax.set_xlabel("true values inside [%]", fontsize=8)
+            ax.grid(axis="x", lw=0.3)
+        axes[0].set_yticks(range(len(names)), names)
+        axes[0].invert_yaxis()
 
 
 def _covered(row: dict[str, Any], level: str) -> str:
@@ -173,11 +160,8 @@ def cells(name: str, s: dict[str, Any]) -> list[str]:
     return [name, trials, *rms, *cover[:2], needed[0], cover[2], needed[1], median]
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/tables/worlds.csv and its figure; `needed`: the factor at which intervals hold as stated."""
-    found = load("calibration_worlds")
-    if found is None:
-        return None
     draw(found["rows"], FIGURE)
     return markdown(HEAD, [cells(name, s) for name, s in found["rows"].items()])
 

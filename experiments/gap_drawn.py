@@ -20,7 +20,7 @@ from typing import Any
 from experiments.blind_check.diagnose import diagnose_folder
 from experiments.blind_check.judge import intervals_hold
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from simgap.attribution.verdict import RECORD
 
 RESULT = Path(__file__).parent / "results" / "gap_labs.json"
@@ -103,11 +103,8 @@ def covered(label: dict[str, Any], found: dict[str, Any]) -> list[bool]:
     return list(intervals_hold({**label, "effects": label["params"]}, found).values()) if ours else []
 
 
-def table(name: str = "gap_labs") -> str | None:
+def table(found: dict[str, Any]) -> str:
     """docs/gap_results.md: open labs, one column a version of the code, or a set of labs."""
-    found = load(name)
-    if not isinstance(found, dict):
-        return None
     runs: dict[str, list[dict[str, Any]]] = found["runs"]
 
     def line(name: str, tiers: Sequence[str], *which: str) -> list[str]:

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from experiments.real import hiro_snap
-from experiments.saving import save
+from experiments.saving import panels, save
 from experiments.sequence_worlds import World, abrupt, draw
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation, most_telling
@@ -207,11 +207,8 @@ def check(cases: list[Case]) -> dict:
     return {"groups": groups, "cases": each}
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """A row for each group of cases and what was known; draws the figure."""
-    found = load("sequences")
-    if found is None:
-        return None
     rows = []
     for group, entry in found["groups"].items():
         for key, label in ROWS.items():
@@ -235,27 +232,19 @@ def table() -> str | None:
 
 def _draw(groups: dict[str, Any], path: Path) -> None:
     """Reliability: probability said of places without labels, and the share that were true."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, ax = plt.subplots(figsize=(4.2, 4.0), layout="constrained")
-    ax.plot([0, 1], [0, 1], color="0.6", lw=0.8)
-    for group, entry in groups.items():
-        bins = entry["none"]["reliability"]
-        ax.plot([b["said"] for b in bins], [b["true"] for b in bins], "-", lw=0.8, label=group)
-        ax.scatter(
-            [b["said"] for b in bins],
-            [b["true"] for b in bins],
-            s=[3 + 40 * b["count"] / max(each["count"] for each in bins) for b in bins],
-        )
-    ax.set_xlabel("probability said of a place")
-    ax.set_ylabel("share that were true")
-    ax.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with panels(path, figsize=(4.2, 4.0)) as ax:
+        ax.plot([0, 1], [0, 1], color="0.6", lw=0.8)
+        for group, entry in groups.items():
+            bins = entry["none"]["reliability"]
+            ax.plot([b["said"] for b in bins], [b["true"] for b in bins], "-", lw=0.8, label=group)
+            ax.scatter(
+                [b["said"] for b in bins],
+                [b["true"] for b in bins],
+                s=[3 + 40 * b["count"] / max(each["count"] for each in bins) for b in bins],
+            )
+        ax.set_xlabel("probability said of a place")
+        ax.set_ylabel("share that were true")
+        ax.legend(fontsize=8)
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.recordings import Case
 from hmmseg.hand.kinematics import inverse, joint_velocity
-from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Fingertip, Noise, Rig, Systematic, read_rig
 from hmmseg.io.task import BlockTask, parse_task, read_task
 from hmmseg.io.trial import Trial
@@ -385,11 +385,10 @@ def deviated(trial: Trial, rig: Rig, hand: Deviations) -> Trial:
     signals, channels = task_space(trial, rig), dict(trial.channels)
     for i in (1, 2):
         give = 1 / (1 + hand.pad_stiffness[i - 1]) - 1
-        tip = np.stack([
-            _of(signals, f"x{i}") + _of(signals, f"fx{i}") / rig.fingertip.normal_stiffness * give,
-            _of(signals, f"y{i}") + _of(signals, f"fy{i}") / rig.fingertip.shear_stiffness * give,
-        ], axis=1)  # fmt: skip
-        speed = np.stack([_of(signals, f"vx{i}"), _of(signals, f"vy{i}")], axis=1)
+        x, y, vx, vy, fx, fy = (getattr(signals, f"{n}{i}") for n in ("x", "y", "vx", "vy", "fx", "fy"))
+        pad = rig.fingertip
+        tip = np.stack([x + fx / pad.normal_stiffness * give, y + fy / pad.shear_stiffness * give], axis=1)
+        speed = np.stack([vx, vy], axis=1)
         nominal_finger = rig.finger(i)
         first, second = np.asarray(nominal_finger.links) * (1 + hand.link_length[2 * i - 2 : 2 * i])
         finger = nominal_finger.model_copy(update={"links": (float(first), float(second))})
@@ -401,7 +400,3 @@ def deviated(trial: Trial, rig: Rig, hand: Deviations) -> Trial:
     for k, name in enumerate(FORCE_CHANNELS):
         channels[name] = (1 + hand.force_gain[k]) * channels[name] + hand.force_bias[k]
     return replace(trial, channels=channels)
-
-
-def _of(signals: Signals, name: str) -> np.ndarray:
-    return getattr(signals, name)

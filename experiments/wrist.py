@@ -26,7 +26,7 @@ from experiments.scoring import (
     summarise_boundaries,
     summarise_properties,
 )
-from experiments.table_text import RESULTS, load, markdown, milliseconds, percent
+from experiments.table_text import RESULTS, markdown, milliseconds, percent
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
@@ -141,11 +141,8 @@ def summary(cases: Sequence[dict]) -> dict:
 WORST = ("wrist", "made-up fingers", "poor sensors", "20 Hz, noisy", "500 Hz")  # look: rows of a page
 
 
-def wrist(every: bool = False) -> str | None:
+def wrist(found: dict, every: bool = False) -> str:
     """docs/wrist.md: all cases of a kind together, and those that are worst; with `every`, each case."""
-    found = load("wrist")
-    if found is None:
-        return None
     head = ["", "trials complete", "boundaries, median", "largest", "90 % hold", "weight, rms", "width, rms",
             "height, rms", "95 % hold"]  # fmt: skip
     rows = []

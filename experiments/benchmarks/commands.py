@@ -20,7 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from experiments.saving import save
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_commands.json"
 REPEATS = 3
@@ -69,11 +69,8 @@ def staged(stages: dict[str, str], files: dict[str, str]) -> dict[str, dict[str,
     return {name: {"processor": s, "share": s / totals[-2]} for name, s in zip(stages, each, strict=True)}
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/benchmarks.md: commands on one 10 s trial, by stage."""
-    found = load("benchmark_commands")
-    if found is None:
-        return None
     tables = [
         markdown(
             [f"stage of `{command}`", "processor", "share"],

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.jaxconfig import configure
@@ -226,11 +226,8 @@ def measure_passivity() -> list[dict[str, float | bool]]:
     return rows
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/virtual_model.md: the haptic loop and one that does nothing."""
-    found = load("haptic_loop")
-    if found is None:
-        return None
     rate = found["rate"]
     rows = [
         ["two blocks", f"{rate['median_us']:.0f} µs", f"{rate['p99_9_us']:.0f} µs",

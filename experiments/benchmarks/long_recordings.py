@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from hmmseg.hand.read import LongRecording
 from hmmseg.io.formats import kind_of, rows_of
 from hmmseg.io.rig import Rig
@@ -108,11 +108,8 @@ def measure(case: Path, path: Path, in_memory: bool) -> dict:
     }  # fmt: skip
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/benchmarks.md: long recordings."""
-    found = load("benchmark_long")
-    if found is None:
-        return None
     rows = [
         [f"{row['rows']:,}", row["from"], f"{row['found']} of {row['rounds']}", f"{row['processor']:.1f} s",
          f"{row['memory_mb']:.0f} MB", {True: "yes", False: "NO", None: ""}[row.get("same_answer")]]

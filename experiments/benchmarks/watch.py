@@ -24,7 +24,7 @@ import numpy as np
 
 from experiments.recordings import list_cases, read_boundaries
 from experiments.saving import save
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
@@ -126,11 +126,8 @@ def summary(errors: list[tuple[float, float]]) -> dict:
     }  # fmt: skip
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/watch.md: what `make bench-watch` measured."""
-    found = load("watch")
-    if found is None:
-        return None
     time, lag, apart = found["timing"], found["by_lag"], found["apart_from_off_line"]
     rows = [
         [f"{time['rows']:,} rows at {time['rate']:.0f} Hz, processor a row, median",

@@ -20,12 +20,12 @@ from experiments.blind_check.signals import (
     SCALE,
     Signals,
     Stage,
+    Values,
     noise_of_channels,
     sample,
     sense,
     task_space,
 )
-from experiments.blind_check.stages import Values
 from experiments.blind_check.worlds import Circumstances, draw_world
 
 TRIALS = 4

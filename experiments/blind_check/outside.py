@@ -13,8 +13,18 @@ from scipy.signal import lfilter
 
 from experiments.blind_check.effects import _sign, fault
 from experiments.blind_check.hand import angles, jacobians
-from experiments.blind_check.signals import ENCODER, HAND, LINKS, READOUT, SCALE, Signals, Stage
-from experiments.blind_check.stages import Rng, Values, added_force
+from experiments.blind_check.signals import (
+    ENCODER,
+    HAND,
+    LINKS,
+    READOUT,
+    SCALE,
+    Rng,
+    Signals,
+    Stage,
+    Values,
+    added_force,
+)
 
 
 def _smooth(x: np.ndarray, s: Signals, time: float) -> np.ndarray:

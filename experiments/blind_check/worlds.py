@@ -14,9 +14,8 @@ import numpy as np
 
 from experiments.blind_check.hand import Rig
 from experiments.blind_check.operator import Style
-from experiments.blind_check.scene import FEET, World
+from experiments.blind_check.scene import FEET, TASKS, Task, World
 from experiments.blind_check.signals import Sampling
-from experiments.blind_check.tasks import TASKS, Task
 
 RATES = (20.0, 20.0, 20.0, 50.0, 50.0, 100.0, 100.0, 200.0, 500.0)  # Hz, as often as listed
 # What a rig that states anything states, as standard deviations (shares but for N and rad).

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
@@ -181,11 +181,8 @@ def run(folder: Path, seeds: int) -> dict:
     return document
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/results.md: errors at both contact boundaries, by what was learned from."""
-    found = load("hiro_snap")
-    if found is None:
-        return None
     rows = []
     for kind, label in SHOWN.items():
         entry = found["kinds"][kind]

@@ -28,18 +28,8 @@ from simgap.simulators.user import load_simulator
 HERE = Path(__file__).resolve().parent
 RESULT = HERE.parent / "results" / "xl330.json"
 SIMULATOR, LOGS = "xl330.py:Pendulum", "xl330_*.csv"
-KEPT = (
-    "verdict",
-    "causes",
-    "indistinguishable",
-    "detection",
-    "effects",
-    "fitted",
-    "discrepancy",
-    "shrinkage",
-    "identifiability",
-    "next_experiment",
-)
+KEPT = ("verdict", "causes", "indistinguishable", "detection", "effects", "fitted", "discrepancy",
+        "shrinkage", "identifiability", "next_experiment")  # fmt: skip
 
 
 def summary(found: RobotDiagnosis) -> dict:
