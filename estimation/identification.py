@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -165,50 +165,40 @@ def identify_aligned(
     aligned: AlignedTrials, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Identification:
     """Properties of every block from aligned trials, pooled; `progress(steps_done, steps_at_most)`."""
-    rng, rig = np.random.default_rng(seed), aligned.rig
-    trials = [one.trial for one in aligned.trials]
+    rng, rig, task = np.random.default_rng(seed), aligned.rig, aligned.task
     weighed, noise = aligned_weights(aligned, rng)
-    sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(aligned, weighed, noise)
-    warnings, notes = misfits(aligned), []
-    predictive, scale = None, None
-    found = posterior(design) if design.unknowns else None
-    sampled = None if found is None else sample(found, seed, progress)
-    weights = {}
-    if sampled is not None and sampled.converged:
-        weights = {u.name[0]: sampled.flat[:, i] for i, u in enumerate(design.unknowns) if u.prop == "weight"}
-    friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng, weights)
-    hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
-    if "friction" in hidden:
-        friction = {obj: FrictionPosterior(None, reason=hidden["friction"], ground=f.ground)
-                    for obj, f in friction.items()}  # fmt: skip
+    post = posterior(design) if design.unknowns else None
+    sampled = None if post is None else sample(post, seed, progress)
+    friction = _friction(aligned, weighed, design, sampled, rng)
     reasons = _reasons(aligned, design, friction)
-    kept: list[int] = []
-    contradicted: dict[str, str] = {}
-    if found is not None and sampled is not None and sampled.converged:
-        predictive = check(found, sampled, rng)
+    predictive, contradicted, centres, kept = None, {}, {}, list[int]()
+    warnings, notes = misfits(aligned), list[str]()
+    if post is not None and sampled is not None and sampled.converged:
+        predictive = check(post, sampled, rng)
         warnings += predictive.warnings
-        notes += [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
+        notes = [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
         contradicted = contradictions(aligned, weighed, design)
         reasons |= contradicted | impossible(design, sampled)
         kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
-        scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
+        centres = {u.name: float(sampled.flat[:, i].mean()) for i, u in enumerate(design.unknowns)
+                   if u.single and i not in sampled.impossible}  # fmt: skip
     elif sampled is not None:
         why = f"the sampler has not converged: {sampled.shortfall}"
         warnings.append(why)
         reasons |= {".".join(u.name): why for u in design.unknowns if u.single}
-    unknowns, centres = tuple(design.unknowns[i] for i in kept), dict[tuple[str, str], float]()
-    if sampled is not None:
-        if sampled.converged:
-            centres = {u.name: float(sampled.flat[:, i].mean()) for i, u in enumerate(design.unknowns)
-                       if u.single and i not in sampled.impossible}  # fmt: skip
+    unknowns = tuple(design.unknowns[i] for i in kept)
+    draws = np.zeros((0, 0))
+    if sampled is not None and kept:
         chain, heavy = sampled.chain[..., kept], [i for i, u in enumerate(unknowns) if u.prop == "weight"]
+        scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
         if scale is not None and heavy:
             chain = scale.corrected(chain, heavy, rng)
             warnings.append(scale.remark())
         sampled = replace(sampled, chain=chain)
-    draws = np.zeros((0, 0)) if sampled is None or not kept else sampled.flat
+        draws = sampled.flat
     num = sum(u.single for u in unknowns)  # singles come first
+    means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(unknowns) if u.single}
     warnings += [
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
@@ -217,20 +207,33 @@ def identify_aligned(
         f"the zero of {name} moves by {size:.2g} N between stretches of free motion; intervals allow for it"
         for name, size in zip(FORCE_CHANNELS, design.moved, strict=True) if size > 0
     ]  # fmt: skip
-    warnings += list(dict.fromkeys(contradicted.values()))
-    warnings += soft_pads(design, rig)
-    warnings += unnamed(aligned.task, design)
-    means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(unknowns) if u.single}
-    warnings += dense(aligned.task, rig, means)
-    centres |= means
+    warnings += dict.fromkeys(contradicted.values())
+    warnings += [*soft_pads(design, rig), *unnamed(task, design), *dense(task, rig, means)]
     friction = {
         k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
     }
     return Identification(
-        aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
+        task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
         draws[:, :num], unknowns[num:], draws[:, num:], sampled if kept else None, friction, reasons,
-        predictive, tuple(warnings), tuple(notes), centres,
+        predictive, tuple(warnings), tuple(notes), centres | means,
     )  # fmt: skip
+
+
+def _friction(
+    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design, sampled: Draws | None,
+    rng: np.random.Generator,
+) -> dict[str, FrictionPosterior]:  # fmt: skip
+    """Friction of every object, given draws of the weights; without values if a recording hides it."""
+    weights = {}
+    if sampled is not None and sampled.converged:
+        weights = {u.name[0]: sampled.flat[:, i] for i, u in enumerate(design.unknowns) if u.prop == "weight"}
+    sd_force = aligned.rig.noise.force or aligned.fit.parameters.scale["force"]
+    friction = friction_posteriors(weighed, aligned.task, aligned.rig, sd_force, rng, weights)
+    for trial in aligned.trials:
+        if "friction" in trial.trial.hidden:
+            friction = {obj: FrictionPosterior(None, reason=trial.trial.hidden["friction"], ground=f.ground)
+                        for obj, f in friction.items()}  # fmt: skip
+    return friction
 
 
 def impossible(design: Design, sampled: Draws) -> dict[str, str]:

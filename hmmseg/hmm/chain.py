@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import jax
 import numpy as np
@@ -25,8 +25,27 @@ class InfeasibleAlignment(ValueError):
         self.reason = reason
 
 
-@register_pytree_node_class
-class Chain:
+class Leaves:
+    """Base of pytrees whose children are the attributes named in `leaves`."""
+
+    leaves: ClassVar[tuple[str, ...]]
+
+    def __init_subclass__(cls) -> None:
+        register_pytree_node_class(cls)
+
+    def tree_flatten(self) -> tuple[tuple, None]:
+        """The leaves, for JAX."""
+        return tuple(getattr(self, name) for name in self.leaves), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, leaves: tuple) -> Self:
+        """An instance with these leaves, which may be any JAX values."""
+        tree = object.__new__(cls)
+        vars(tree).update(zip(cls.leaves, leaves, strict=True))
+        return tree
+
+
+class Chain(Leaves):
     """Log weights of a left-to-right chain of `num_states` states; they need not be normalised.
 
     A pytree: a chain may be an argument of functions under jit, vmap and grad, with traced weights.
@@ -44,7 +63,7 @@ class Chain:
         ValueError: wrong shapes, NaN or +inf.
     """
 
-    __slots__ = ("bands", "log_final", "log_initial")
+    leaves = ("bands", "log_initial", "log_final")
 
     def __init__(
         self,
@@ -71,20 +90,6 @@ class Chain:
         first[0] = last[-1] = 0.0
         self.log_initial = end_weights("log_initial", log_initial, first)
         self.log_final = end_weights("log_final", log_final, last)
-
-    def tree_flatten(self) -> tuple[tuple, None]:
-        """The weights, for JAX."""
-        return (self.bands, self.log_initial, self.log_final), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, leaves: tuple) -> Chain:
-        """A chain of weights that may be any JAX values."""
-        chain = object.__new__(cls)
-        chain.bands, chain.log_initial, chain.log_final = leaves
-        return chain
-
-    def __reduce__(self) -> tuple:
-        return Chain.tree_unflatten, (None, (self.bands, self.log_initial, self.log_final))
 
     @property
     def num_states(self) -> int:

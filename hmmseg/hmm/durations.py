@@ -18,17 +18,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.tree_util import register_pytree_node_class
 from numpy.typing import ArrayLike
 
-from hmmseg.hmm.chain import InfeasibleAlignment, end_weights, jumps_between
+from hmmseg.hmm.chain import InfeasibleAlignment, Leaves, end_weights, jumps_between
 from hmmseg.hmm.recursions import NEVER, backwards, forwards, known, log_add, log_sum, numbers, pick, row
 
 RARE = 1e-12  # numerics: probability of the longest durations, which are left out
 
 
-@register_pytree_node_class
-class DurationChain:
+class DurationChain(Leaves):
     """Left-to-right chain with a distribution of durations for each state; a pytree.
 
     Args:
@@ -44,7 +42,7 @@ class DurationChain:
     """
 
     varying, num_samples = False, None  # as of a Chain whose weights do not change in time
-    _LEAVES = ("pmf", "survival", "jumps", "log_initial", "log_final")
+    leaves = ("pmf", "survival", "jumps", "log_initial", "log_final")
     pmf: np.ndarray  # (num_states, longest): log probability of lasting n samples in column n - 1
     survival: np.ndarray  # the same for a state that the recording's end cuts off
     jumps: np.ndarray  # (num_bands, num_states): jumps[d - 1, k] from k to k + d
@@ -77,18 +75,6 @@ class DurationChain:
             weights[: jump.size] = jump
         self.log_initial = end_weights("log_initial", log_initial, initial)
         self.log_final = end_weights("log_final", log_final, final)
-
-    def tree_flatten(self) -> tuple[tuple, None]:
-        """The tables, for JAX."""
-        return tuple(getattr(self, name) for name in self._LEAVES), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, leaves: tuple) -> DurationChain:
-        """A chain of tables that may be any JAX values."""
-        chain = object.__new__(cls)
-        for name, leaf in zip(cls._LEAVES, leaves, strict=True):
-            setattr(chain, name, leaf)
-        return chain
 
     @property
     def num_states(self) -> int:

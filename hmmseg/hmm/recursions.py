@@ -18,7 +18,7 @@ Rabiner, Proc. IEEE 77(2), 1989; sampling: Scott, J. Am. Stat. Assoc. 97, 2002.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import partial, reduce, wraps
 from typing import Any
 
 import jax
@@ -242,59 +242,61 @@ def trace_back(table: Array, w: Array, k: Array, n: Array, block: int) -> Array:
     return lax.while_loop(lambda carry: (carry[0] > 0) & (carry[1] > 0), look, start)[2]
 
 
-def one_by_one(core: Callable, parallel: bool | None) -> Callable:
+def one_by_one(function: Callable) -> Callable:
     """Wrap a function so that vmap runs recordings in turn on a CPU, which keeps each in its cache.
 
     The rule may be applied after tracing, outside the double-precision setting under which that was done.
     """
-    run = jax.custom_batching.custom_vmap(core)
 
-    @run.def_vmap
-    def rule(axis_size: int, in_batched: Sequence[bool], *args: Array):  # type: ignore[no-untyped-def]
-        def in_turn(*args: Array):  # type: ignore[no-untyped-def]
-            moving = [a for a, moves in zip(args, in_batched, strict=True) if moves]
+    @wraps(function)
+    def batchable(*args: Array, parallel: bool | None) -> Any:
+        core = partial(function, parallel=parallel)
+        run = jax.custom_batching.custom_vmap(core)
 
-            def each(moving: Sequence[Array]):  # type: ignore[no-untyped-def]
-                rest = iter(moving)
-                return run(*(next(rest) if moves else a for a, moves in zip(args, in_batched, strict=True)))
+        @run.def_vmap
+        def rule(axis_size: int, in_batched: Sequence[bool], *args: Array) -> Any:
+            def in_turn(*args: Array) -> Any:
+                moving = [a for a, moves in zip(args, in_batched, strict=True) if moves]
 
-            return lax.map(each, moving)
+                def each(moving: Sequence[Array]) -> Any:
+                    rest = iter(moving)
+                    return run(*(next(rest) if m else a for a, m in zip(args, in_batched, strict=True)))
 
-        together = jax.vmap(core, in_axes=[0 if moves else None for moves in in_batched])
-        with jax.enable_x64(True):
-            found = by_device(parallel, in_turn, together, *args)
-        return found, jax.tree.map(lambda _: True, found)
+                return lax.map(each, moving)
 
-    return run
+            together = jax.vmap(core, in_axes=[0 if moves else None for moves in in_batched])
+            with jax.enable_x64(True):
+                results = by_device(parallel, in_turn, together, *args)
+            return results, jax.tree.map(lambda _: True, results)
+
+        return run(*args)
+
+    return batchable
 
 
-def best_path(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
-              parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
+@one_by_one
+def best_path(
+    x: Array, w: Array, initial: Array, final: Array, n: Array, parallel: bool | None
+) -> tuple[Array, Array]:
     """Starts (num_states,) and log weight of the most probable path."""
-
-    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> tuple[Array, Array]:
-        table, _ = forward(x, w, initial, n, jnp.maximum, parallel)
-        last = row(table, n - 1) + final
-        k = argmax(last)
-        in_blocks, at_once = (partial(trace_back, block=size) for size in (BLOCK, len(x)))
-        return by_device(parallel, in_blocks, at_once, table, w, k, n), last[k]
-
-    return one_by_one(core, parallel)(x, w, initial, final, n)
+    table, _ = forward(x, w, initial, n, jnp.maximum, parallel)
+    last = row(table, n - 1) + final
+    k = argmax(last)
+    in_blocks, at_once = (partial(trace_back, block=size) for size in (BLOCK, len(x)))
+    return by_device(parallel, in_blocks, at_once, table, w, k, n), last[k]
 
 
-def posterior(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
-              parallel: bool | None) -> tuple[Array, Array, Array]:  # fmt: skip
+@one_by_one
+def posterior(
+    x: Array, w: Array, initial: Array, final: Array, n: Array, parallel: bool | None
+) -> tuple[Array, Array, Array]:
     """Log evidence, and probabilities of states (num_timesteps, num_states) and of moves.
 
     Moves (num_timesteps - 1, num_bands, num_states) are indexed as `w`, staying included.
     """
-
-    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> tuple[Array, Array, Array]:
-        before, taken = forward(x, w, initial, n, log_add, parallel)
-        states, moves = smooth(before, w, final, n, parallel)
-        return log_sum(row(before, n - 1) + final, 0) + taken, states, moves
-
-    return one_by_one(core, parallel)(x, w, initial, final, n)
+    before, taken = forward(x, w, initial, n, log_add, parallel)
+    states, moves = smooth(before, w, final, n, parallel)
+    return log_sum(row(before, n - 1) + final, 0) + taken, states, moves
 
 
 def probabilities(log_weights: Array, axis: int | tuple[int, ...]) -> Array:
@@ -304,14 +306,11 @@ def probabilities(log_weights: Array, axis: int | tuple[int, ...]) -> Array:
     return weights / jnp.maximum(total, 1.0)  # the largest weight is one, or all are zeros
 
 
-def evidence(x: Array, w: Array, initial: Array, final: Array, n: Array, *, parallel: bool | None) -> Array:
+@one_by_one
+def evidence(x: Array, w: Array, initial: Array, final: Array, n: Array, parallel: bool | None) -> Array:
     """Log of the summed weight of all paths."""
-
-    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> Array:
-        table, taken = forward(x, w, initial, n, log_add, parallel)
-        return log_sum(row(table, n - 1) + final, 0) + taken
-
-    return one_by_one(core, parallel)(x, w, initial, final, n)
+    table, taken = forward(x, w, initial, n, log_add, parallel)
+    return log_sum(row(table, n - 1) + final, 0) + taken
 
 
 def draw(x: Array, w: Array, initial: Array, final: Array, n: Array, key: Array,

@@ -123,15 +123,6 @@ class Posterior:
                 intervals[k] = 1.0 + np.searchsorted(cumulative, quantiles * cumulative[-1])
         return intervals
 
-    def confidence(self, alignment: Alignment, within: int = 0) -> np.ndarray:
-        """Probability (num_states - 1,) that each boundary of an alignment is correct to `within` samples."""
-        cumulative = np.pad(np.cumsum(self.boundary, axis=0), ((1, 0), (0, 0)))
-        at = alignment.starts[1:] - 1  # the interval between two samples in which the boundary lies
-        low = np.clip(at - within, 0, len(cumulative) - 1)
-        high = np.clip(at + within + 1, 0, len(cumulative) - 1)
-        k = np.arange(cumulative.shape[1])
-        return cumulative[high, k] - cumulative[low, k]
-
 
 @register_dataclass
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ from hmmseg.levels import MOVED, SETTLING
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from hmmseg.segmentation.emissions import Features, Parameters
 from hmmseg.segmentation.free_contacts import (
-    IMPOSSIBLE,
     RINGING,
     Block,
     FreeContacts,
@@ -44,7 +43,8 @@ from hmmseg.segmentation.free_contacts import (
 )
 
 DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
-STAGES = 3  # prior: most of an Erlang law, in which a contact state settles
+STAGES = 3  # prior: most stages of the Erlang distribution of settling times
+IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 BRIEF = 1e-8  # prior: factor for leaving unsettled: a bounce is no grip, a halt in the air no place
 
 

@@ -31,7 +31,7 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
-from hmmseg.robust import white_sd
+from hmmseg.robust import median_of_known, white_sd
 from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
@@ -113,6 +113,10 @@ class Parameters:
     scale: dict[str, float]
     width: dict[str, float] = field(default_factory=dict)
     levels: tuple[dict[int, float], ...] = ()
+
+    def force_sd(self, s: Signals) -> float:
+        """Noise of one force of a trial [N]: stated, or as learned in free motion."""
+        return self.scale["force"] if np.isnan(s.sd_force) else s.sd_force
 
 
 def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.ndarray,
@@ -263,6 +267,12 @@ def noise_sd(values: np.ndarray) -> float:
     """Robust standard deviation of white sample noise; NaN for fewer than three samples."""
     finite = values[np.isfinite(values)]
     return float(white_sd(finite)) if finite.size > 2 else np.nan
+
+
+def channel_sd(stated: np.ndarray, values: np.ndarray) -> float:
+    """Noise of a channel: the median of the `stated` sds, or else estimated from its values."""
+    sd = median_of_known(stated)
+    return noise_sd(values) if np.isnan(sd) else sd
 
 
 def thin(

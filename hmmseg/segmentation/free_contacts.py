@@ -131,7 +131,6 @@ ROUNDS = 8  # numerics: most iterations; it converges sooner
 # cited: s; a shorter touch cannot have been meant as a lift: grip and load forces rise in turn before a lift,
 # taking 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
 TAP = 0.2
-IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 
 States = tuple[tuple[str, int | None], ...]
 Trained = tuple[States, tuple[Block, ...], Parameters, np.ndarray, np.ndarray]

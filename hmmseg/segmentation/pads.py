@@ -34,8 +34,8 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import SURE, TAIL, decisive
-from hmmseg.robust import NORMAL, median_of_known, robust_sd, weighted_median
-from hmmseg.segmentation.emissions import Parameters, noise_sd
+from hmmseg.robust import NORMAL, robust_sd, weighted_median
+from hmmseg.segmentation.emissions import Parameters, channel_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
     NONE,
@@ -83,15 +83,14 @@ class Squeeze:
 
 def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | None:
     """The squeeze between `start` and `end` [s]; None if there are too few samples."""
-    sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+    sd = p.force_sd(s)
     one, two = s.fx1 - p.bias[0], -(s.fx2 - p.bias[2])
     alone = (np.maximum(one, two) > SURE * sd) & (np.minimum(one, two) <= SURE * sd)
     rate = np.gradient(s.distance, s.t) if s.derived else s.vx2 - s.vx1
     use = (s.t >= start) & (s.t <= end) & np.isfinite(one + two + s.distance + rate)
     if use.sum() < 6 or not (~alone & use).any():
         return None
-    stated = median_of_known(s.sd_x)
-    noise = np.sqrt(2.0) * (noise_sd(s.x1) if np.isnan(stated) else stated)
+    noise = np.sqrt(2.0) * channel_sd(s.sd_x, s.x1)
     noise, load = noise if noise > 0 else SLOWEST_SD, np.where(alone, np.nan, one + two)
     return Squeeze(s.t[use], s.distance[use], rate[use], load[use], noise, np.sqrt(2.0) * sd)
 

@@ -15,7 +15,7 @@ from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, evenly, normal
 from hmmseg.segmentation.changes import DISCREPANCY, Change, Penetration, Prior, cut, moment
-from hmmseg.segmentation.emissions import WINDOW, Features, Parameters, noise_sd
+from hmmseg.segmentation.emissions import WINDOW, Features, Parameters, channel_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.spans import Span, spans_between
 
@@ -134,10 +134,9 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
     normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
     inward = np.stack([s.x1, -s.x2])
-    sd_x, sd_y = _sd(s.sd_x, s.x1), _sd(s.sd_y, s.y1)
+    sd_x, sd_y = channel_sd(s.sd_x, s.x1), channel_sd(s.sd_y, s.y1)
     rates, sinking, sd_vx, sd_vy = _rates(s, inward, sd_x, sd_y)
-    force = parameters.scale["force"] if np.isnan(s.sd_force) else s.sd_force
-
+    force = parameters.force_sd(s)
     pads, toe = shown(sensing.pads), sensing.normal.toe
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
@@ -159,11 +158,6 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     )  # fmt: skip
 
 
-def _sd(stated: np.ndarray, values: np.ndarray) -> float:
-    """Noise of a channel: stated, or estimated from the recording."""
-    return float(np.nanmedian(stated)) if np.isfinite(stated).any() else noise_sd(values)
-
-
 def _rates(
     s: Signals, inward: np.ndarray, sd_x: float, sd_y: float
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
@@ -172,7 +166,7 @@ def _rates(
     Velocities that are differences of positions have separate rates before and after.
     """
     if not s.derived:
-        closing, noise = np.stack([s.vx1, -s.vx2]), (_sd(s.sd_vx, s.vx1), _sd(s.sd_vy, s.vy1))
+        closing, noise = np.stack([s.vx1, -s.vx2]), (channel_sd(s.sd_vx, s.vx1), channel_sd(s.sd_vy, s.vy1))
         return np.stack([closing, closing]), np.stack([-s.vy, -s.vy]), *noise
     (left, noise), (right, _), (rising, _) = (one_sided(s.t, x) for x in (*inward, s.y))
     return np.stack([left, right], axis=1), -rising, noise * sd_x, noise * sd_y

@@ -183,13 +183,12 @@ def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
 
 
 def known(
-    file: str, rate: float, shown: Iterable[Subtask], edges: Iterable[float],
-    failed: Failure | None = None, recorded: Any = None,
-) -> Segmentation:  # fmt: skip
+    file: str, rate: float, shown: Iterable[Subtask], edges: Iterable[float], recorded: Any = None
+) -> Segmentation:
     """A segmentation known exactly: subtasks `shown` between `edges` [s] (one more), without uncertainty."""
     times = [float(edge) for edge in edges]
     spans = spans_between(list(shown), times, [0.0] * len(times), [(edge, edge) for edge in times])
-    return Segmentation(file, rate, None, spans, failed, recorded=recorded)
+    return Segmentation(file, rate, None, spans, recorded=recorded)
 
 
 def spans_table(segmentation: Segmentation) -> Table:

@@ -20,8 +20,8 @@ import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.levels import MOVED, SETTLING, SURE, TAIL, decisive
-from hmmseg.robust import median_of_known, robust_sd
-from hmmseg.segmentation.emissions import Parameters, noise_sd
+from hmmseg.robust import robust_sd
+from hmmseg.segmentation.emissions import Parameters, channel_sd
 
 
 def lagging(values: np.ndarray, kept: np.ndarray, place: np.ndarray, share: np.ndarray) -> np.ndarray:
@@ -155,7 +155,7 @@ def stretches(
     rests while its support carries part of it.
     """
     inside = (s.t >= start) & (s.t <= end)
-    sd_force = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+    sd_force = p.force_sd(s)
     fx1, fx2 = s.fx1 - p.bias[0], s.fx2 - p.bias[2]
     fy = s.fy1 + s.fy2 - p.bias[1] - p.bias[3]
     noise = np.sqrt(2.0) * sd_force
@@ -172,8 +172,7 @@ def stretches(
             out.append(None)
             continue
         interval = float(np.median(np.diff(s.t, prepend=2 * s.t[0] - s.t[1])[use]))
-        sd, t = median_of_known(stated), s.t[use]
-        sd = noise_sd(value) if np.isnan(sd) else sd
+        sd, t = channel_sd(stated, value), s.t[use]
         there &= (s.t >= t[0] - FARTHEST) & (s.t <= t[-1] + FARTHEST)
         out.append(Stretch(t, load[use], interval, s.t[there], value[there], max(sd, 1e-9)))
     return out[0], out[1]
@@ -182,8 +181,7 @@ def stretches(
 def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]:
     """Largest ratio of shear to grip force that each finger surely reaches between two times [s]."""
     inside = (s.t >= start) & (s.t <= end)
-    sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
-    out = []
+    sd, out = p.force_sd(s), []
     for grip, shear in ((s.fx1 - p.bias[0], s.fy1 - p.bias[1]), (-(s.fx2 - p.bias[2]), s.fy2 - p.bias[3])):
         use = inside & (grip > SURE * sd) & np.isfinite(shear)
         if use.any():
