@@ -1,5 +1,4 @@
-"""`hmmseg decompose` and `hmmseg effects`: what a task can reveal, and what may cause a gap, without a
-recording."""
+"""`hmmseg decompose` and `hmmseg effects`: what a task reveals, and what may cause a sim-to-real gap."""
 
 from __future__ import annotations
 

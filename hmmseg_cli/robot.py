@@ -1,5 +1,4 @@
-"""`hmmseg calibrate`, and `hmmseg diagnose --simulator` or `--mjcf`: a robot's logs against its owner's
-model."""
+"""`hmmseg calibrate`, and `hmmseg diagnose --simulator` or `--mjcf`: a robot's logs against a model of it."""
 
 from __future__ import annotations
 

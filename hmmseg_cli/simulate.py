@@ -151,15 +151,15 @@ def _spare_inputs(folder: Path, names: Mapping[str, str], inputs: Iterable[Path 
 
 def _draw_replay(result: Replay, segmentation: Segmentation, path: Path) -> None:
     """Plot measured and predicted grip, net and shear forces over coloured subtasks."""
-    from hmmseg.plot.spans import Panel, stacked_panels
+    from hmmseg.plot.spans import stacked_panels
     from hmmseg.plot.style import BLUE, canvas
 
     signals, predicted = result.signals, result.predicted
     labels = {"grip": "Grip\n[N]", "fx": "Net $f_x$\n[N]", "fy": "Net $f_y$\n[N]", "shear": "Shear\n[N]"}
-    panels = [Panel(label, getattr(signals, key)) for key, label in labels.items()]
+    panels = {"Distance\n[cm]": 100 * signals.distance}
+    panels |= {label: getattr(signals, key) for key, label in labels.items()}
     with canvas(path, height=6.4) as figure:
-        distance = Panel("Distance\n[cm]", 100 * signals.distance)
-        axes = stacked_panels(figure, signals.t, [distance, *panels], segmentation)
+        axes = stacked_panels(figure, signals.t, panels, segmentation)
         for ax, key in zip(axes[1:], labels, strict=True):
             ax.plot(signals.t, predicted[key], color=BLUE, lw=0.9, label="virtual model")
         axes[1].lines[0].set_label("recording")

@@ -1,5 +1,4 @@
-"""Checks of a recording against what a hand can do; each finding comes with the line of `rig.toml` that
-mends it.
+"""Checks of a recording against the abilities of a hand, each with the line of `rig.toml` that mends it.
 
 A hand is sampled at a few Hz to some 20 kHz, travels less than 3 m, its links do not wind twice around, and
 its velocities are the derivatives of its positions. Fingers that hold something press towards each other,

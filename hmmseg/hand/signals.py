@@ -3,9 +3,12 @@
 Fingers are x1, y1, ... (left) and x2, y2, ... (right); the object sees their means and differences. Positions
 are the undeformed contact faces, forces are exerted by the fingertips.
 
-Velocities that a drive computes from its own positions come late: without a tachometer, v[k] = (x[k] -
-x[k-m]) / (t[k] - t[k-m]) is the velocity m / 2 samples ago, with the positions' noise. At 20 Hz that is 25
-ms, more than the admissible error of a contact change.
+Velocities that a drive computes from its own positions come late. Without a tachometer,
+
+    v[k] = (x[k] - x[k-m]) / (t[k] - t[k-m])
+
+is the velocity m / 2 samples ago, with the positions' noise. At 20 Hz that is 25 ms, more than the admissible
+error of a contact change.
 
 The fingers of one gripper, and what they hold, may roll together about their midpoint. Given as the column
 `hand_roll` [rad] (counterclockwise, 0 where the fingers are level), a roll is removed as the recording is

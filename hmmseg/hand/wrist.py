@@ -11,6 +11,7 @@ in the other ways that a rig may have it, and the one in which every hold lifts 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from collections.abc import Mapping
@@ -81,16 +82,6 @@ def _travel(trial: Trial, name: str) -> float:
     return float(np.nanmax(trial.channels[name]) - np.nanmin(trial.channels[name]))
 
 
-def counts_closing(trial: Trial, rig: Rig) -> InputError:
-    """The error for an opening that grows as the gripper closes."""
-    gripper = rig.wrist
-    most = float(sum(bridged(trial.channels[name], trial.t).max() for name in gripper.opening))
-    name = gripper.opening[0]
-    remedy = Finding(name, "", changed([name], rig, sign=-1, offset=round(most, 4))).remedy
-    problem = "is widest while the hand carries something: it counts how far the gripper has closed"
-    return InputError(f"{trial.file}: column {name}", problem, remedy)
-
-
 def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
     """The error for a flipped sign: lifts take weight `load` [N] off the hand.
 
@@ -113,30 +104,6 @@ def pose_remark(trial: Trial, rig: Rig, load: float) -> str:
         f"{where} bear {load:.3g} N of what is lifted, but go against the hand's own acceleration in free "
         "motion: they change with the pose, and loads are wrong by as much"
     )
-
-
-def points_down(trial: Trial, rig: Rig) -> InputError:
-    """The error for an axis that counts downwards: lifted objects would go down."""
-    gripper = rig.wrist
-    axis = gripper.up.lstrip("-")
-    said = axis if gripper.up.startswith("-") else f"-{axis}"
-    name = {str(each): name for each, name in gripper.position.items()}[axis]
-    where = f"{trial.file}: column {name}"
-    return InputError(where, "goes down whenever the hand bears something, as if it counted downwards",
-                      f'up = "{said}" under [gripper]')  # fmt: skip
-
-
-def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
-    """The error for position columns of the wrong axes: lifted objects would pull sideways."""
-    gripper = rig.wrist
-    up, position = gripper.up.lstrip("-"), {str(axis): name for axis, name in gripper.position.items()}
-    others = [axis for axis in AXES if axis != up and axis in position]
-    across = gripper.closing if gripper.closing in others else others[0]
-    swapped = position | {up: position[across], across: position[up]}
-    text = ", ".join(f"{axis} = {json.dumps(swapped[axis])}" for axis in AXES if axis in swapped)
-    where = f"{trial.file}: columns {position[up]}, {position[across]}"
-    problem = f"say that the hand's load pulls along {across} and never along {up}: axes exchanged"
-    return InputError(where, problem, f"position = {{{text}}} under [gripper]")
 
 
 LEAST = 3  # numerics: samples; fewer have no scatter
@@ -185,19 +152,35 @@ def contradiction(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, held:
     An opening of the other sign takes holds for free motion, which the noise about the tool's model shows;
     axes that are exchanged or reversed leave that noise unchanged.
     """
-    try:
+    gripper, flipped = rig.wrist, None
+    with contextlib.suppress(InputError):
         flipped = find_grips(trial, rig, pose, -opening, None)
-    except InputError:
-        flipped = None
     if flipped is not None and _lifts_all(flipped.loads) and flipped.tool.noise < held.tool.noise:
-        return counts_closing(trial, rig)
-    others = [(replace(pose, up=-pose.up), points_down),
-              (replace(pose, up=pose.across, across=pose.up), exchanged_axes)]  # fmt: skip
-    borne = [[_load(grip, other, held.force, held.tool) for grip in held.grips
-              if _raised(grip, other).any()] for other, _ in others]  # fmt: skip
-    least = [min(load for load in loads if load) if _lifts_all(loads) else 0.0 for loads in borne]
-    best = int(np.argmax(least))
-    return others[best][1](trial, rig) if least[best] > 0 else None
+        name = gripper.opening[0]
+        widest = float(sum(bridged(trial.channels[name], trial.t).max() for name in gripper.opening))
+        remedy = Finding(name, "", changed([name], rig, sign=-1, offset=round(widest, 4))).remedy
+        problem = "is widest while the hand carries something: it counts how far the gripper has closed"
+        return InputError(f"{trial.file}: column {name}", problem, remedy)
+    least = []
+    for other in (replace(pose, up=-pose.up), replace(pose, up=pose.across, across=pose.up)):
+        lifting = [grip for grip in held.grips if _raised(grip, other).any()]
+        loads = [_load(grip, other, held.force, held.tool) for grip in lifting]
+        least.append(min(load for load in loads if load) if _lifts_all(loads) else 0.0)
+    if not any(least):
+        return None
+    up, position = gripper.up.lstrip("-"), {str(axis): name for axis, name in gripper.position.items()}
+    if least[0] >= least[1]:
+        reversed_up = up if gripper.up.startswith("-") else f"-{up}"
+        problem = "goes down whenever the hand bears something, as if it counted downwards"
+        remedy = f'up = "{reversed_up}" under [gripper]'
+        return InputError(f"{trial.file}: column {position[up]}", problem, remedy)
+    others = [axis for axis in AXES if axis != up and axis in position]
+    across = gripper.closing if gripper.closing in others else others[0]
+    swapped = position | {up: position[across], across: position[up]}
+    text = ", ".join(f"{axis} = {json.dumps(swapped[axis])}" for axis in AXES if axis in swapped)
+    problem = f"say that the hand's load pulls along {across} and never along {up}: axes exchanged"
+    where = f"{trial.file}: columns {position[up]}, {position[across]}"
+    return InputError(where, problem, f"position = {{{text}}} under [gripper]")
 
 
 def _lifts_all(loads: list[float | None]) -> bool:
@@ -332,9 +315,9 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     elif held.tool.against:
         raise other_sign(trial, rig)
     if held.grips and not held.lifts:
-        text = contradiction(trial, rig, pose, opening, held)
-        if text is not None:
-            raise text
+        error = contradiction(trial, rig, pose, opening, held)
+        if error is not None:
+            raise error
     loaded = [grip for grip, load in zip(held.grips, held.loads, strict=True) if load is None or load != 0]
     found = as_fingers(trial, rig, pose, held.tool, opening, held.force, loaded or held.grips, pressing)
     order = order_warnings(trial, rig, held.tool, held.free)

@@ -8,7 +8,6 @@ shows which label would tell most.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -32,20 +31,13 @@ LEAST = 1e-3  # numerics: probability of a naming below which it is neglected
 EXACT = 1e-6  # numerics: least noise of a level, as a share of a feature's spread
 
 
-@dataclass(frozen=True)
-class Boundaries:
-    """Posterior of all boundaries: `crossing` (num_cells - 1, num_boundaries), the probability of each cell
-    edge; `gain` (num_boundaries,) [nats], the expected reduction of entropy by a label."""
-
-    crossing: np.ndarray
-    gain: np.ndarray
-
-
-def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], lag: np.ndarray) -> Boundaries:
+def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse],
+        lag: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Mixture over all courses of `crossings` [(num_cells - 1, num_changes), ...], the posterior of each.
 
-    `lag` (num_boundaries,) [cells]. The gain is the mutual information of naming and label: the entropy of
-    the mixture less the mean entropy of its components.
+    `lag` (num_boundaries,) [cells]. Returns the posterior (num_cells - 1, num_boundaries) of each boundary
+    at each cell edge, and the expected gain (num_boundaries,) [nats] of a label: the mutual information of
+    naming and label, which is the entropy of the mixture less the mean entropy of its components.
     """
     from scipy.ndimage import convolve1d, shift  # slow to import
 
@@ -68,7 +60,7 @@ def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], lag: np
         mixed = p @ table
         gain.append(max(float(entr(mixed).sum() - p @ entr(table).sum(1)), 0.0))
         mixture.append((1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / len(mixed))
-    return Boundaries(np.array(mixture).T, np.array(gain))
+    return np.array(mixture).T, np.array(gain)
 
 
 def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
@@ -133,32 +125,33 @@ def _segment(trial: Trial, data: SequenceFeatures, model: SequenceModel) -> Segm
     names = model.task.sequence
     try:
         alignment = model.align(data)
-        known = _posterior(data, model, alignment)
+        crossing, gain = _posterior(data, model, alignment)
     except InfeasibleAlignment as error:
         k = min(error.subtask, len(names) - 1)
         failed = Failure(k, names[k], None, f"has no samples left: {error.reason}")
         return Segmentation(trial.file, trial.rate, float("-inf"), (), failed, recorded=trial)
-    spans = _spans(trial, data, model, alignment, known)
+    spans = _spans(trial, data, model, alignment, crossing)
     question = None
     if any(span.alternatives for span in spans):
-        question = Question(trial.file, names[int(known.gain.argmax()) + 1], float(known.gain.max()))
+        question = Question(trial.file, names[int(gain.argmax()) + 1], float(gain.max()))
     return Segmentation(trial.file, trial.rate, alignment.log_evidence, spans, model.failure(data),
                         recorded=trial, question=question)  # fmt: skip
 
 
-def _posterior(data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior) -> Boundaries:
-    """Of all boundaries, from the model's courses where it has any, else from its own alignment."""
+def _posterior(data: SequenceFeatures, model: SequenceModel,
+               alignment: AlignmentPosterior) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """As from `mix`, from the model's courses where it has any, else from its own alignment."""
     if model.courses:
         return mix([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
     crossing = alignment.boundary[:, : len(model.task.sequence) - 1].copy()
     if model.detectors is not None:
         for b in np.flatnonzero(model.detectors.jitter > 0):
             crossing[:, b] = gaussian_filter1d(crossing[:, b], model.detectors.jitter[b], mode="constant")
-    return Boundaries(crossing, np.zeros(crossing.shape[1]))
+    return crossing, np.zeros(crossing.shape[1])
 
 
 def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior,
-           known: Boundaries) -> tuple[Span, ...]:  # fmt: skip
+           posterior: np.ndarray) -> tuple[Span, ...]:  # fmt: skip
     """Spans at the model's own boundaries, with the uncertainty of the mixture over courses."""
     names, optional = model.task.sequence, optional_states(model.task, False)
     visited = alignment.smoothed[0].copy()  # probability that a path visits each state
@@ -168,7 +161,7 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
     first, last, step = float(trial.t[0]), float(trial.t[-1]), float(data.edges[1] - data.edges[0])
     found, dated = [], []
     for k in kept[1:]:
-        crossing, scattered = known.crossing[:, k - 1], bool(model.courses)
+        crossing, scattered = posterior[:, k - 1], bool(model.courses)
         found.append(_boundary(data.edges, crossing, first, last, scattered))
         dated.append(found[-1][0])
         if scattered:
@@ -183,7 +176,7 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
         # As in every alignment, a state that occurs lasts at least a cell; medians alone do not ensure that.
         median = max(starts[-1][0] + step, min(median, last - step * (len(kept) - number)))
         starts.append((median, sd, (min(low, median), max(high, median))))
-        elsewhere.append(places(data.edges, known.crossing[:, k - 1], median) if model.courses else ())
+        elsewhere.append(places(data.edges, posterior[:, k - 1], median) if model.courses else ())
     ends = [*starts[1:], (last, 0.0, (last, last))]
     return tuple(
         Span(names[k], None, names[k], start[0], end[0], start[1], end[1], start[2], end[2], others)

@@ -146,7 +146,7 @@ def test_boundaries_and_gain_from_the_joint_table_of_naming_and_label():
                 0.5, emissions, np.ones(changes + 1), named, np.array([[0.0], [3.0]] * np.ones(changes))
             )
         )
-    found = mix(tables, courses, lag)
+    crossing, gains = mix(tables, courses, lag)
     offsets = np.arange(-40, 41)
     law = np.exp(-np.abs(offsets) / 1.5)
     law /= law.sum()
@@ -163,9 +163,9 @@ def test_boundaries_and_gain_from_the_joint_table_of_naming_and_label():
         mixed = joint.sum(0)
         alone = joint.sum(1, keepdims=True) * mixed
         gain = (joint * np.log(np.where(joint > 0, joint / np.where(joint > 0, alone, 1), 1))).sum()
-        assert found.gain[b] == pytest.approx(gain, rel=1e-3)
+        assert gains[b] == pytest.approx(gain, rel=1e-3)
         expected = (1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / cells
-        np.testing.assert_allclose(found.crossing[:, b], expected, atol=1e-4)
+        np.testing.assert_allclose(crossing[:, b], expected, atol=1e-4)
 
 
 def test_places_are_what_lies_near_a_time():
