@@ -19,7 +19,7 @@ from hmmseg.sequence.courses import (
     COARSE_CELLS,
     Course,
     Weighing,
-    coarse,
+    coarsen,
     find_courses,
     naming,
     probabilities,
@@ -41,7 +41,7 @@ def known(world: World, labelled: int) -> Known:
     truth = np.array([each.shares(b) for each, b in zip(data, world.boundaries, strict=True)])
     labels = np.where(np.arange(len(truth))[:, None] < labelled, truth, np.nan)
     found = find_courses(
-        [coarse(each.values, factor) for each in data], len(world.task.sequence), list(labels)
+        [coarsen(each.values, factor) for each in data], len(world.task.sequence), list(labels)
     )
     return found, labels, truth
 

@@ -1,4 +1,4 @@
-"""Signals, or any channels, stacked over time with the subtasks of a segmentation behind them."""
+"""Signals, or any channels, stacked over time, with the subtasks of a segmentation behind them."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Panel:
 def stacked_panels(
     figure: Figure, t: np.ndarray, panels: Sequence[Panel], segmentation: Segmentation
 ) -> list[Axes]:
-    """Draw signals at t (num_timesteps,) [s], one above the other, and the subtasks behind them."""
+    """Draw signals at t (num_timesteps,) [s] in stacked panels, with the subtasks behind them."""
     axes = list(np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)))
     for ax, panel in zip(axes, panels, strict=True):
-        # Single samples between missing ones would not show as a line.
+        # Single samples between missing ones would be invisible in a line.
         there = np.r_[False, np.isfinite(panel.values), False]
         alone = there[1:-1] & ~there[:-2] & ~there[2:]
         ax.plot(t, panel.values, color=INK, lw=0.8)
@@ -57,7 +57,7 @@ def stacked_panels(
 
 
 def shade_spans(ax: Axes, segmentation: Segmentation) -> None:
-    """Colour the subtasks by state; boundaries as a thin line in their 90 % interval."""
+    """Colour the subtasks by state; draw boundaries as a thin line in their 90 % interval."""
     colours = state_colours([span.state for span in segmentation.spans])
     for span in segmentation.spans:
         ax.axvspan(span.start, span.end, color=colours[span.state], alpha=0.32, lw=0, zorder=0)
@@ -67,7 +67,7 @@ def shade_spans(ax: Axes, segmentation: Segmentation) -> None:
 
 
 def name_spans(ax: Axes, segmentation: Segmentation) -> None:
-    """Subtask names above a panel, slanted so that short subtasks keep theirs."""
+    """Write the subtasks' names above a panel, slanted so that short ones fit."""
     for span in segmentation.spans:
         anchor = 0.65 * span.start + 0.35 * span.end
         ax.annotate(
@@ -78,7 +78,7 @@ def name_spans(ax: Axes, segmentation: Segmentation) -> None:
 
 
 def draw_signals(signals: Signals, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
-    """Mean position, finger distance, grip, net and shear forces over coloured subtasks.
+    """Plot mean position, finger distance, grip, net and shear forces over coloured subtasks.
 
     After the paper's Figures 5 to 7.
     """
@@ -99,7 +99,7 @@ MOST = 12  # look: panels that stay legible on one page
 
 
 def draw_channels(trial: Trial, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
-    """Every channel of a trial, the first twelve at most, over coloured subtasks, in its own units."""
+    """Plot every channel of a trial, MOST at most, over coloured subtasks, in its own units."""
     names = list(trial.channels)[:MOST]
     panels = [Panel(name, trial.channels[name]) for name in names]
     with canvas(path, height=1.8 + 0.95 * len(panels)) as figure:

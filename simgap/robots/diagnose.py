@@ -15,14 +15,12 @@ from simgap.progress import Progress, silent
 from simgap.robot_effects import STATED, UNMEASURED, doubted, effects_of
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed, Point
-from simgap.robots.phases import Phases, phases_of
-from simgap.robots.rows import folds_of, noises
+from simgap.robots.rows import Phases, folds_of, noises, phases_of
 from simgap.robots.search import Search, Settled
 from simgap.robots.sets import Identifiability
-from simgap.robots.verdict import RobotVerdict, next_log, verdict_on
+from simgap.robots.verdict import RobotVerdict, Shrinkage, next_log, shrinkage, verdict_on
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 

@@ -45,7 +45,6 @@ class Linear:
     diverged: tuple[str, ...]
     dropped: int  # windows whose rollout was not finite
     rates: np.ndarray  # (N,) the simulated channel's rate
-    wobble: np.ndarray | None  # (N, K) as in `Composed`
 
     def with_moved(self, more: Mapping[str, Moved], diverged: Sequence[str] = ()) -> Linear:
         """With some effects' columns added or replaced."""
@@ -85,8 +84,7 @@ def linearise(
     residual = composed.rows.observed - base.rows
     starts = _by_start(composed, base) if starts is None else starts
     dropped = sum(channels is None for channels in base.read)
-    rates, wobble = _rates(composed, base), composed.wobble
-    found = Linear(point, composed.rows, residual, starts, {}, (), dropped, rates, wobble)
+    found = Linear(point, composed.rows, residual, starts, {}, (), dropped, _rates(composed, base))
     moved, diverged = {}, []
     for number, name in enumerate(effects):
         say(f"{number + 1} of {len(effects)}, {name}")

@@ -58,10 +58,6 @@ class Composed:
         motion = () if restarts(simulator) else tuple(motions(simulator, recordings))
         return cls(simulator, tuple(recordings), windows, effects, noise, rows, motion=motion)
 
-    def along(self, logs: Sequence[int]) -> Composed:
-        """The same along some of the logs alone, which keep their numbers."""
-        return self.among([k for k, w in enumerate(self.windows) if w.log in logs])
-
     def calm(self) -> Composed:
         """The same in flight and at rest alone, where there are such windows; else this."""
         kept = [k for k, w in enumerate(self.windows) if w.regime != STRIKES]
