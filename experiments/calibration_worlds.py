@@ -70,7 +70,7 @@ def score(found: Replicate, seed: int = 0) -> dict[str, Any]:
 
 
 def _reaches(found: Segmentation, truth: np.ndarray) -> list[float]:
-    """How far each true boundary lies from that found, as a share of the way to that end of its interval."""
+    """Distance of each true boundary from the one found, over that to the same end of its interval."""
     ends = [(s.start, *s.start_90) for s in found.spans[1:]]
     return [
         float((t - at) / max(high - at, 1e-9) if t > at else (at - t) / max(at - low, 1e-9))
@@ -99,7 +99,7 @@ def summary(scored: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 "z_rms": float(np.sqrt(np.mean([p["z"] ** 2 for p in mine]))),
                 "coverage_95": float(np.mean([abs(p["rank"] - 0.5) < 0.475 for p in mine])),
             }
-    # By what factor intervals would have to be wider to hold just as often as they say.
+    # Factor by which intervals would have to widen to reach their nominal coverage.
     out["needed_95"] = float(np.quantile(np.abs(z), 0.95) / ndtri(0.975)) if z.size else None
     reach = np.concatenate([s["reach_90"] for s in scored])
     out["needed_90"] = float(np.quantile(reach, 0.9)) if reach.size else None
@@ -118,7 +118,7 @@ def clustered(inside: Sequence[np.ndarray]) -> tuple[float | None, float | None]
     share = float(every.mean())
     scores = np.array([(r - share).sum() for r in rows]) / np.mean([r.size for r in rows])
     spread = float(np.std(scores, ddof=1) / np.sqrt(len(rows))) if len(rows) > 1 else 0.0
-    # Agresti and Coull's: where all are inside, a standard error of nought says too much.
+    # Agresti and Coull's: if all are inside, a standard error of zero would be too confident.
     share_at_least = (every.sum() + 2) / (every.size + 4)
     return share, max(spread, float(np.sqrt(share_at_least * (1 - share_at_least) / (every.size + 4))))
 

@@ -28,7 +28,7 @@ WEAK = 0.3  # of the gap of held-out trials: causes that explain less are none
 
 
 def outcome(label: dict[str, Any], found: dict[str, Any]) -> str:
-    """What became of a case: `quiet`, `false alarm`, `named`, `set`, `beside others`, `half` (of a pair),
+    """The outcome of a case: `quiet`, `false alarm`, `named`, `set`, `beside others`, `half` (of a pair),
     `too small`, `unknown`, `wrong name`, `missed`, `error`."""
     if "error" in found:
         return "error"
@@ -57,7 +57,8 @@ def outcome(label: dict[str, Any], found: dict[str, Any]) -> str:
 
 
 def row(label: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
-    """A case's diagnosis in short; `gain` [nats] of the true effect by itself, None where it scatters."""
+    """Summary of a case's diagnosis; `gain` [nats] is that of the true effect alone, None if it is a
+    scatter."""
     gains = found.get("gains", {})
     return {
         "case": label["case"], "tier": label["tier"], "effects": label["effects"],

@@ -51,7 +51,7 @@ def list_cases(folder: Path) -> list[Path]:
 
 
 def read_case(folder: Path) -> Case:
-    """One case; true properties from labels.json next to it if that is there, else actual.toml."""
+    """Read a case; true properties come from a neighbouring labels.json if present, else actual.toml."""
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     if not isinstance(task, BlockTask):
         raise InputError(str(folder / "task.toml"), "is a plain ordered task", "objects and moves")

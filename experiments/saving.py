@@ -30,7 +30,7 @@ def commit_of(root: Path = ROOT) -> str | None:
 
 
 def save(path: Path, document: dict[str, Any]) -> None:
-    """Write a result with `made_by`, the commit of this code; ValueError where it holds NaN."""
+    """Write a result with `made_by`, the commit of this code; ValueError if it contains NaN."""
     text = json.dumps({**document, "made_by": commit_of()}, indent=1, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text + "\n", encoding="utf-8")

@@ -18,7 +18,7 @@ from hmmseg.io.trial import Trial
 CELLS = (300, 900)  # chosen: samples of a trial
 STATES = (2, 10)  # chosen: of a task, fewest and most
 TRIALS = (1, 8)  # chosen: fewest and most
-LAG = 0.01  # chosen: of a trial; a controller's labels lie off what its channels show, the same in all trials
+LAG = 0.01  # chosen: share of a trial; a controller's labels have a common lag to what channels show
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class World:
 
 
 def draw(seed: int, alike: float | None = None) -> World:
-    """One world; `alike`: how far neighbouring states differ, in standard deviations of the noise."""
+    """One world; `alike` is the difference of neighbouring states in standard deviations of the noise."""
     rng = np.random.default_rng(seed)
     num_states = int(rng.integers(STATES[0], STATES[1] + 1))
     num_trials = int(rng.integers(TRIALS[0], TRIALS[1] + 1))

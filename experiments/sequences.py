@@ -124,7 +124,7 @@ def answers(case: Case) -> dict:
 
 
 def score(case: Case, found: list[Segmentation], without: int | None = None) -> dict:
-    """Errors as shares of the trial, coverage, and what was said of the places; one entry a boundary.
+    """Errors as shares of the trial, coverage, and stated probabilities of places; one entry per boundary.
 
     `place`: probability of the place given, and whether the truth is nearer to it than to any other (within
     its 90 % interval's width of 2 % of the trial at least); `listed`: the truth is at one of these places.
@@ -179,7 +179,7 @@ def summary(scores: list[dict]) -> dict:
 
 
 def check(cases: list[Case]) -> dict:
-    """All cases, printed as they come."""
+    """Score all cases, printing each."""
     rows = []
     for case in cases:
         row = answers(case)
@@ -231,7 +231,7 @@ def table(found: dict) -> str:
 
 
 def _draw(groups: dict[str, Any], path: Path) -> None:
-    """Reliability: probability said of places without labels, and the share that were true."""
+    """Plot reliability: stated probability of places without labels against the share that were true."""
     with panels(path, figsize=(4.2, 4.0)) as ax:
         ax.plot([0, 1], [0, 1], color="0.6", lw=0.8)
         for group, entry in groups.items():

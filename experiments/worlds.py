@@ -30,7 +30,7 @@ from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 SCENE = Path(__file__).parent / "scene"
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
-BIAS = 0.02  # N, what [systematic] admits where a world has biases
+BIAS = 0.02  # N; standard deviation under [systematic] in worlds with biases
 PADS = 0.3  # share, likewise of pads
 HAND = Systematic(force_bias=(0.01,) * 4, force_gain=(0.01,) * 4, joint_offset=(0.001,) * 4,
                   link_length=(0.001,) * 4, pad_stiffness=(0.1, 0.1))  # fmt: skip
@@ -47,7 +47,7 @@ def scene(rate: float | None = None) -> tuple[Rig, BlockTask]:
 
 
 def task_of(blocks: int) -> BlockTask:
-    """A tower of so many blocks reversed; one block is moved on the ground."""
+    """The task of reversing a tower of `blocks`; a single block is moved on the ground."""
     if blocks == 2:
         return scene()[1]
     names = [f"b{k}" for k in range(blocks)]
@@ -202,7 +202,7 @@ def _recorded(world: World, simulated: SimulatedTrial, task: BlockTask, rig: Rig
         clean = recorded(resampled, task, rig.model_copy(update={"noise": Noise(**quiet)}), {})
         trial = _coloured(trial, clean, world.coloured)
     trial = disturbed(trial, simulated.boundaries, world.cell, simulated.seed)
-    rng = np.random.default_rng([number, 6])  # of the hand: all trials of a replicate alike
+    rng = np.random.default_rng([number, 6])  # one hand for all trials of a replicate
     if world.bias:
         signs = world.bias * BIAS * rng.choice([-1.0, 1.0], 4)
         shifted = {n: trial.channels[n] + b for n, b in zip(FORCE_CHANNELS, signs, strict=True)}

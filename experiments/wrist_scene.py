@@ -52,7 +52,7 @@ def performances(count: int = 2, rate: float = 50.0, seed: int = 0) -> list[Simu
 
 
 def wrist_rig(setup: Setup, **gripper) -> Rig:
-    """The rig that says of the setup what the caller wants said."""
+    """The rig of a setup, with the given entries under [gripper]."""
     said = {"position": ["px", "py", "pz"], "opening": "gap", "wrench": ["Fx", "Fy", "Fz"],
             "closing": "y", "frame": setup.frame} | gripper  # fmt: skip
     if setup.tilt or setup.heading:

@@ -64,7 +64,7 @@ TABLES: tuple[tuple[str, str, str, Callable[..., str | None], str], ...] = (
 
 
 def fill(text: str, name: str, table: str) -> str:
-    """Text with what stands between the markers of `name` replaced; ValueError without markers."""
+    """Replace the text between the markers of `name` by a table; ValueError without markers."""
     pattern = re.compile(rf"(<!-- {name} -->\n).*?(<!-- /{name} -->)", re.DOTALL)
     if not pattern.search(text):
         raise ValueError(f"no markers <!-- {name} --> ... <!-- /{name} -->")

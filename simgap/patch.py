@@ -23,6 +23,7 @@ from simgap.effects import catalogue, effect_named
 from simgap.effects.base import KINEMATICS, Performance
 from simgap.gap.twins import altered, carried, recorded, scene_of
 from simgap.gap.twins import performed as perform
+from simgap.world.dynamics import interpolated
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.replay import Replay, replay
@@ -164,16 +165,15 @@ def replayed(
             channels = restored(channels, dict(values))
     moved = replace(trial, channels=channels)
     found = replay(moved, task, hand, blocks, boundaries=boundaries, surroundings=around)
-    n, force = len(found.t), found.motion.force
     truth = Performance(
-        found.t, found.motion.position, found.motion.velocity, force.reshape(n, 2, 2),
+        found.t, found.motion.position, found.motion.velocity, found.motion.force,
         np.asarray(boundaries, float), rig, *carried(found.t, boundaries, task, blocks),
     )  # fmt: skip
     acting = sorted(map(effect_named, rig.effects), key=lambda e: -e.stage)
     felt = {e.name: rig.effects[e.name] for e in acting if e.stage != KINEMATICS}
     truth = altered(truth, felt, np.random.default_rng(0))
-    force = np.stack([np.interp(found.signals.t, found.t, c) for c in truth.force.reshape(n, 4).T], 1)
+    force = interpolated(found.signals.t, found.t, truth.force)
     for effect in acting:
         if effect.finish is not None:
             force = effect.finish(force, dict(rig.effects[effect.name]))
-    return replace(found, force=force.reshape(-1, 2, 2))
+    return replace(found, force=force)

@@ -60,7 +60,7 @@ def processor(arguments: list[str], cache: str | None = None) -> float:
 
 
 def staged(stages: dict[str, str], files: dict[str, str]) -> dict[str, dict[str, float]]:
-    """Processor time [s] of each stage, and its share of what a command does: all but the last."""
+    """Processor time [s] of each stage, and its share of the whole except the last stage."""
     lines, totals = [], [0.0]
     for line in stages.values():
         lines.append(line.format(**files))

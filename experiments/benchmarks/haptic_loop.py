@@ -48,7 +48,7 @@ HAND_STIFFNESS, SQUEEZE = 150.0, 0.01  # N/m and m: the operator closes by 1.5 N
 
 
 def measure_rate(seconds: float, paced: bool, rate: float = 4000.0) -> dict[str, float]:
-    """Times of every step [us] of so many seconds at a rate, and what memory grew by [bytes]."""
+    """Times of all steps [us] over `seconds` at a rate, and the growth of memory [bytes]."""
     done = simulate_trial(TASK, Rig(fingertip=PADS), PAPER_BLOCKS, seed=0)
     places = {name: float(done.motion.blocks[0, k, 0]) for k, name in enumerate(TASK.objects)}
     model = VirtualModel(Rig(fingertip=PADS), TASK, PAPER_BLOCKS, places)
@@ -87,7 +87,7 @@ def measure_rate(seconds: float, paced: bool, rate: float = 4000.0) -> dict[str,
 
 
 def _spin(micro: float) -> Callable[[], object]:
-    """Arithmetic that touches no memory and takes about so many us of the processor."""
+    """Arithmetic without memory access that takes about the given processor time [us]."""
     work = lambda n: sum(range(n))  # noqa: E731
     began = time.thread_time_ns()
     for _ in range(1000):
@@ -199,7 +199,7 @@ def squeeze(
     energy, returned, speeds = 0.0, 0.0, []
     for _ in range(round(seconds * rate)):
         force = model.step(place, speed, period)
-        # One sample of delay: what the model says now is rendered a period later.
+        # One sample of delay: the model's current output is rendered a period later.
         held, waiting = waiting, force
         if controlled:
             held = control.render(held, place)

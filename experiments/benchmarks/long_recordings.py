@@ -52,12 +52,12 @@ def simulated(lab: Path, case: Path) -> None:
     rig = case.parent / "rig_faster.toml"
     rig.write_text(faster)
     given = ["--task", str(lab / "task.toml"), "--rig", str(rig), "--seed", str(SEED), "--output", str(case)]
-    # In a process of its own: those that are measured inherit the peak memory of this one.
+    # In a separate process: the measured ones inherit the peak memory of this one.
     subprocess.run([sys.executable, "-m", "hmmseg_cli.main", "simulate", *given, "--quiet"], check=True)
 
 
 def performed(case: Path) -> tuple[BlockTask, Rig]:
-    """The case's task, as often as it is seen, and its rig."""
+    """The case's task, repeated as often as recorded, and its rig."""
     task = Task.read(case / "task.toml")
     assert isinstance(task, BlockTask)
     return replace(task, repeat="unknown"), Rig.read(case / "rig.toml")
@@ -72,7 +72,7 @@ def rounds_of(case: Path, rig: Rig, rounds: int) -> Iterator[dict[str, np.ndarra
 
 
 def write(case: Path, rig: Rig, rounds: int, path: Path) -> None:
-    """A recording of so many rounds as Parquet or NPZ."""
+    """Write a recording of a number of rounds as Parquet or NPZ."""
     if path.suffix == ".parquet":
         import pyarrow as pa
         import pyarrow.parquet as pq

@@ -84,7 +84,8 @@ def timing(case: Path) -> dict:
 
 
 def boundaries(case: Path, file: Path, lag: float) -> tuple[list, bool, bool]:
-    """Settled boundaries (t, sd), whether a row before the end was said not to fit, and the last verdict."""
+    """Settled boundaries (t, sd), whether any row before the end was reported as not fitting, and the last
+    verdict."""
     watcher, alarm = Watcher(case / "task.toml", case / "rig.toml", lag), False
     for t, row in zip(*rows_of(case, file), strict=True):
         alarm |= not watcher.update(float(t), row).fits
@@ -95,7 +96,7 @@ def boundaries(case: Path, file: Path, lag: float) -> tuple[list, bool, bool]:
 
 
 def off_line(case: Path, file: Path) -> tuple[list, bool]:
-    """The same from the whole recording, one trial by itself."""
+    """The same from the whole recording, analysed alone."""
     from hmmseg.api import segment
 
     found = segment(file, case / "task.toml", case / "rig.toml")[0]

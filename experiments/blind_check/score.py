@@ -95,7 +95,7 @@ def _bootstrapped(statistic: Callable[[np.ndarray], float], n: int) -> dict[str,
 
 Row = dict[str, Any]
 SIZES = (0.0, 0.1, 0.3, 1.0)
-# What is given by bracket of every circumstance too.
+# Figures that are also given by bracket of every circumstance.
 BRACKETED = ("false_alarms", "named_right", "outside_right")
 
 
@@ -141,7 +141,7 @@ def _tier(rows: Sequence[Row], *names: str) -> list[Row]:
 
 
 def _above(rows: Sequence[Row], *names: str) -> list[Row]:
-    """Those of some tiers whose effects can be seen."""
+    """Rows of some tiers whose effects are detectable."""
     return [r for r in _tier(rows, *names) if r["above"]]
 
 

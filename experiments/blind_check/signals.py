@@ -1,4 +1,4 @@
-"""What the sensors make of a motion: a chain of stages from the true tips to the numbers in a CSV."""
+"""The recording chain: stages from the true tips to the numbers in a CSV."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def sense(motion: Motion, rig: Rig, stages: Sequence[tuple[int, Stage]], rng: np
 def sample(
     signals: Signals, sampling: Sampling, rng: np.random.Generator, noisy: bool = True
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Written times and columns at the rig's rate; noise is drawn alike whatever the effects are."""
+    """Recorded times and columns at the rig's rate; noise draws do not depend on the effects."""
     rig, t = signals.rig, signals.t
     count = int(np.floor((t[-1] - 0.01) * rig.rate)) + 1
     times = np.arange(count) / rig.rate

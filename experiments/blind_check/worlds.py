@@ -50,7 +50,7 @@ class Circumstances:
     mirrored: bool = False
 
     def rig(self, nominal: Rig) -> Rig:
-        """The rig that is stated."""
+        """The rig as stated."""
         return replace(
             nominal, rate=self.rate, normal_stiffness=self.normal_stiffness,
             shear_stiffness=self.shear_stiffness, angle_noise=nominal.angle_noise * self.sensors,
@@ -58,13 +58,13 @@ class Circumstances:
         )  # fmt: skip
 
     def velocity_noise(self, nominal: Rig) -> float:
-        """Stated noise of rates [rad/s]; of differences it is what their angles' makes of them."""
+        """Stated noise of rates [rad/s]; for differences, the one propagated from the angles."""
         if self.differences:
             return float(np.sqrt(2) * nominal.angle_noise * self.sensors * self.rate)
         return nominal.velocity_noise * self.sensors
 
     def world(self) -> World:
-        """What is true of pads and blocks."""
+        """The true pads and blocks."""
         return World(
             self.normal_stiffness, self.shear_stiffness,
             uneven=tuple(self.errors.get("pad_stiffness", (0.0, 0.0))),  # type: ignore[arg-type]
@@ -72,7 +72,7 @@ class Circumstances:
         )  # fmt: skip
 
     def style(self) -> Style:
-        """How it is worked."""
+        """The operator's style."""
         p, s = self.pace, self.servo
         return Style(
             pace=(0.93 * p, 1.08 * p), stagger=(0.5 * self.stagger, self.stagger), profile=self.profile,
@@ -80,7 +80,7 @@ class Circumstances:
         )  # fmt: skip
 
     def sampling(self) -> Sampling:
-        """How it is read."""
+        """The sampling."""
         return Sampling(noise=self.noise, colour=self.colour, differences=self.differences)
 
     @property
@@ -131,7 +131,7 @@ def draw_world(rng: np.random.Generator, fastest: float = float("inf")) -> Circu
 
 
 def world_of(label: dict) -> Circumstances:
-    """The world that a label tells."""
+    """The world described by a label."""
     table = label["world"]
     return Circumstances(**table | {"noise": tuple(table["noise"])})
 

@@ -99,7 +99,7 @@ def dropping(case: Case) -> int:
 
 
 def before_lift(case: Case) -> dict:
-    """Where the flicker lies: samples of hold-above-ground in true free motion, pickup and place."""
+    """Counts of samples labelled hold-above-ground in true free motion, pickup and place: the flicker."""
     steps = subtasks(case.task)
     names = np.array(["free" if s.state == FREE else s.name for s in steps])
     counts = dict.fromkeys(("free", "pickup", "place"), 0)

@@ -36,7 +36,7 @@ from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
 SOFT = 0.01  # chosen: rad
-EVERY = 3  # numerics: of logs that a fit sees, one in so many motions' repeats
+EVERY = 3  # numerics: a fit sees one of this many repeats of a motion
 DRAWS = 2000  # numerics: of the bootstrap
 M6 = {  # start, least, most, usual size
     "stall": (6.0, 0.1, 20, 2), "emf": (1.0, 0, 5, 0.4), "viscous": (0.02, 0, 1, 0.05),

@@ -131,7 +131,7 @@ def with_labels(trials: list, kind: Kind, channels: tuple[str, ...], seed: int) 
 
 
 def uncropped_clock(trials: list, kind: Kind) -> list[list[float]]:
-    """The training-mean predictor where the clock does give the labels away (leave one out)."""
+    """Leave-one-out errors of the training mean without cropping, where the clock reveals the labels."""
     labels = np.array([labels for _, labels in trials])
     means = (labels.sum(0) - labels) / (len(labels) - 1)
     return [[float(row[b]) for b in kind.scored] for row in means - labels]

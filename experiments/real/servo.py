@@ -87,7 +87,7 @@ class Servo:
         return out | {"armature": more * (mass * length**2 + parameters["armature"]) - rod}
 
     def simulate(self, parameters, recording, start=None):
-        """Semi-implicit Euler at 5 ms or less; friction holds where it can."""
+        """Integrate by semi-implicit Euler at 5 ms or less, with stiction."""
         begin = (0.0, 0.0) if start is None else (start["position"], start["position_rate"])
         values = np.array([self.with_arm(parameters)[n] for n in self.parameters])
         columns = [np.ascontiguousarray(recording[n], dtype=float) for n in ("goal", "volts", "on")]

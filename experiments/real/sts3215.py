@@ -43,8 +43,8 @@ from simgap.simulators.user import checked
 
 TOLD = 0.1  # chosen: share of the inertia; that of the rotor is known to some 5 %
 ROTOR = 0.0275  # cited: kg m^2; fits of this servo by Rhoban/bam's users, 0.027 to 0.028
-SIGN = 10.24  # data sheet: the load register's direction stands in bit 10, in units of a hundredth
-SPURIOUS = -3.14  # rad; what the bench's reader gives where it fails
+SIGN = 10.24  # data sheet: bit 10 of the load register is the direction; units of a hundredth
+SPURIOUS = -3.14  # rad; value of a failed reading on the bench
 PLANTED = 3  # chosen: spurious samples, each in another log
 FEW = 10  # logs of a configuration that a case takes at most
 GOAL = ">= 97 %"
@@ -63,7 +63,7 @@ class Case:
     new: tuple[str, ...]
     stated: tuple[float, float, float]  # mass [kg], length [m], register of the old
     truth: dict[str, float]
-    alone: bool  # whether the equations tell it alone
+    alone: bool  # whether the equations distinguish it from all others
     between: tuple[Any, Any]  # the configurations
 
 
@@ -136,7 +136,7 @@ def _case(
 
 
 def told_alone(stated: tuple[float, float, float], truth: dict[str, float]) -> bool:
-    """Whether the equations tell a change from any other (see above)."""
+    """Whether the equations distinguish a change from any other (see above)."""
     mass, length, _ = stated
     if len(truth) != 1 or "gain" in truth:
         return len(truth) == 1

@@ -76,12 +76,12 @@ class Pendulum:
     }
 
     def simulate(self, parameters, recording, start=None):
-        """Semi-implicit Euler at 1 ms or less; friction holds where it can."""
+        """Integrate by semi-implicit Euler at 1 ms or less, with stiction."""
         begin = (0.0, 0.0) if start is None else (start["position"], start["position_rate"])
         values = np.array([parameters[n] for n in self.parameters])
         columns = [np.ascontiguousarray(recording[n]) for n in ("pwm", "torque_enable")]
         angle = swing(values, recording.t, *columns, *begin)
-        # The encoder is the first of five reads: what it tells is that much older than its stamp.
+        # The encoder is the first of five reads, so its value is older than its time stamp.
         return {"position": angle - EARLIER * np.gradient(angle, recording.t)}
 
 

@@ -35,7 +35,7 @@ def right(one: Mapping[str, Any]) -> bool:
     allowed = {r for f in one["faults"] for r in f["right"]}
     met = all(every & set(f["right"]) for f in one["faults"] if above(f))
     strange = [n for n in _physical(named) if n not in allowed]
-    # In a set, what stands for a fault may be any of its rivals.
+    # In a set, any of its rivals may stand for a fault.
     spare = len([f for f in one["faults"] if not set(named) & set(f["right"])])
     return met and len(strange) <= spare and one["found"]["verdict"] in ("named", "set")
 

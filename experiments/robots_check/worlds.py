@@ -197,7 +197,7 @@ def _replayed(robot: Robot, world: World, shown: Mapping, states: list[np.ndarra
 
 
 def _hold(robot: Robot, model: Any, data: Any) -> None:
-    """Keep what is carried where the grip closes on it."""
+    """Keep a carried body where the grip closes on it."""
     if robot.carried is None:
         return
     along, up, site = robot.carried

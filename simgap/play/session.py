@@ -13,7 +13,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, parse_task
 from simgap.play.world import STIFFNESS, PlayedWorld
-from simgap.world.dynamics import CONTROL_PERIOD
+from simgap.world.dynamics import CONTROL_PERIOD, interpolated
 from simgap.world.properties import Blocks, lay_out
 from simgap.world.simulate import record, scene_files, trial_csv
 
@@ -163,7 +163,7 @@ class Session:
         rate = self.rig.rate or RATE
         t = np.arange(int(len(rows) * CONTROL_PERIOD * rate)) / rate
         fine = np.arange(1, len(rows) + 1) * CONTROL_PERIOD
-        at = np.stack([np.interp(t, fine, column) for column in rows.T], axis=1).reshape(t.size, 3, 2, 2)
+        at = interpolated(t, fine, rows.reshape(-1, 3, 2, 2))
         self.check_folder(folder)
         number = 1
         while (folder / f"trial_{number:02d}.csv").exists():

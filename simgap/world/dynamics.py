@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 # Laws of one contact: a unilateral Kelvin-Voigt spring, and Coulomb friction with an anchor.
@@ -164,6 +165,12 @@ def record_of(rows: Array, num_blocks: int) -> Record:
     n, b = num_blocks, 12
     return Record(pair(0, 2), pair(4, 2), pair(8, 2), pair(b, n), pair(b + 2 * n, n),
                   rows[:, b + 4 * n : b + 6 * n].reshape(-1, 2, n), rows[:, b + 6 * n :])  # fmt: skip
+
+
+def interpolated(t: np.ndarray, fine: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (T, ...) at times `fine` (T,), interpolated linearly at times t (n,): (n, ...)."""
+    columns = values.reshape(len(fine), -1).T
+    return np.stack([np.interp(t, fine, column) for column in columns], 1).reshape(t.size, *values.shape[1:])
 
 
 def pairs(num_blocks: int) -> tuple[tuple[int, int], ...]:

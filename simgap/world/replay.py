@@ -18,7 +18,7 @@ from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import segment
-from simgap.world.dynamics import BUCKET, CONTROL_PERIOD, Record
+from simgap.world.dynamics import BUCKET, CONTROL_PERIOD, Record, interpolated
 from simgap.world.operator import Plan, Window
 from simgap.world.properties import Blocks, standing_heights
 from simgap.world.virtual_model import Surroundings, physics, rollout, standing, substeps_for
@@ -176,22 +176,28 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     position, velocity = (z @ TO_TIPS.T for z in path.at(t))
     constants = physics(rig, [blocks[name] for name in task.objects], surroundings)
     start = standing(constants, task, places(signals, path, task, np.asarray(boundaries)))
-    moved = [jnp.asarray(_padded(z).reshape(-1, 2, 2)) for z in (position, velocity)]
+    padding = ((0, -t.size % BUCKET), (0, 0))
+    moved = [jnp.asarray(np.pad(z, padding, "edge").reshape(-1, 2, 2)) for z in (position, velocity)]
     motion = rollout(constants, start, *moved, CONTROL_PERIOD, substeps_for(constants, CONTROL_PERIOD))
     motion = jax.tree.map(lambda a: np.asarray(a)[: t.size], motion)
-    force = np.stack([np.interp(signals.t, t, column) for column in motion.force.reshape(-1, 4).T], -1)
-    measured = np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], -1)
-    return Replay(signals, force.reshape(-1, 2, 2), measured.reshape(-1, 2, 2), t, motion)
+    force = interpolated(signals.t, t, motion.force)
+    return Replay(signals, force, _forces(signals).reshape(-1, 2, 2), t, motion)
+
+
+def _forces(signals: Signals) -> np.ndarray:
+    """Measured forces fx1, fy1, fx2, fy2 (T, 4) [N]."""
+    return np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], 1)
 
 
 def finger_motion(signals: Signals) -> Motion:
     """Smoothed motion in x, y, distance, offset: in a grip the last two are constant while the hand moves."""
-    pick = lambda names: np.stack([getattr(signals, name) for name in names], 1)  # noqa: E731
-    scale = np.sqrt([1.0, 1.0, 4.0, 4.0])  # sd_* are those of a mean of two; a difference has twice as much
-    return smooth(signals.t, pick(("x", "y", "distance", "offset")),
-                  np.stack([signals.vx, signals.vy, signals.vx2 - signals.vx1, signals.vy2 - signals.vy1], 1),
-                  pick(("sd_x", "sd_y", "sd_x", "sd_y")) * scale,
-                  pick(("sd_vx", "sd_vy", "sd_vx", "sd_vy")) * scale)  # fmt: skip
+    s, scale = signals, np.sqrt([1.0, 1.0, 4.0, 4.0])  # sd_* are those of a mean; differences have twice them
+    position = np.stack([s.x, s.y, s.distance, s.offset], 1)
+    velocity = np.stack([s.vx, s.vy, s.vx2 - s.vx1, s.vy2 - s.vy1], 1)
+    sd_position, sd_velocity = (
+        np.stack(sds * 2, 1) * scale for sds in ([s.sd_x, s.sd_y], [s.sd_vx, s.sd_vy])
+    )
+    return smooth(s.t, position, velocity, sd_position, sd_velocity)
 
 
 def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarray) -> dict[str, float]:
@@ -220,10 +226,6 @@ def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarr
     for k, name in enumerate(n for n in task.objects if n not in x):
         x[name] = max(path.position[:, 0].max(), *x.values()) + APART * (k + 1)
     return x
-
-
-def _padded(rows: np.ndarray) -> np.ndarray:
-    return np.pad(rows, ((0, -len(rows) % BUCKET), (0, 0)), "edge")
 
 
 def residual_summary(
@@ -288,11 +290,11 @@ def plan_again(
 
 def _load(signals: Signals, sd: float, t: np.ndarray) -> np.ndarray:
     """Smoothed forces (len(t), 4) [N] of the tips x1, y1, x2, y2; zero where they are within the noise."""
-    force = np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], 1)
+    force = _forces(signals)
     unknown, noise = np.full_like(force, np.nan), np.full_like(force, sd)
     smoothed = smooth(signals.t, force, unknown, noise, noise)
     load = np.where(np.abs(smoothed.position) > HEARD * smoothed.sd, smoothed.position, 0.0)
-    return np.stack([np.interp(t, signals.t, column) for column in load.T], 1)
+    return interpolated(t, signals.t, load)
 
 
 def _windows_of(task: BlockTask, boundaries: np.ndarray) -> tuple[Window, ...]:

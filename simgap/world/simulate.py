@@ -32,6 +32,7 @@ from simgap.world.dynamics import (
     Physics,
     Record,
     State,
+    interpolated,
     perform,
     resting_state,
 )
@@ -215,19 +216,11 @@ def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks:
     fine = np.arange(n) * CONTROL_PERIOD
     rate = rig.rate or DEFAULT_RATE
     t = np.arange(int(round(performance.duration * rate, 6))) / rate
-    place, speed, force = (
-        _at(t, fine, values) for values in (motion.position, motion.velocity, motion.force)
-    )
+    place, speed, force = (interpolated(t, fine, z) for z in (motion.position, motion.velocity, motion.force))
     trial = record(t, place, speed, force, rig, np.random.default_rng([seed, 2]), f"simulated, seed {seed}")
     order = {name: k for k, name in enumerate(task.objects)}
     truth = [time for w in performance.windows for time in _boundaries(w, order[w.object], fine, motion)]
     return SimulatedTrial(trial, np.array(truth), fine, motion, blocks, seed, task, rig)
-
-
-def _at(t: np.ndarray, fine: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values at sampling times t, interpolated linearly between milliseconds."""
-    flat = values.reshape(len(fine), -1)
-    return np.stack([np.interp(t, fine, column) for column in flat.T], 1).reshape(t.size, *values.shape[1:])
 
 
 def _boundaries(window: Window, block: int, t: np.ndarray, motion: Record) -> list[float]:
