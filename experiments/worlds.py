@@ -25,7 +25,7 @@ from hmmseg.io.trial import Trial
 from simgap.gap.twins import recorded
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.operator import OperatorSettings, Plan, Window, minimum_jerk
-from simgap.world.properties import Block, random_properties
+from simgap.world.properties import Block
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 SCENE = Path(__file__).parent / "scene"
@@ -56,6 +56,16 @@ def task_of(blocks: int) -> BlockTask:
     task = parse_task({"objects": {n: {"on": on} for n, on in under.items()}, "moves": moves})
     assert isinstance(task, BlockTask)
     return task
+
+
+def random_properties(task: BlockTask, seed: int) -> dict[str, Block]:
+    """Draw blocks for every object of a task from what two fingers can handle.
+
+    Uniform: weights 0.25-0.65 N, widths 14-29 mm, heights 12-19 mm, friction 1.0-1.4.
+    """
+    rng = np.random.default_rng([seed, 1])
+    return {name: Block(rng.uniform(0.25, 0.65), rng.uniform(0.014, 0.029), rng.uniform(0.012, 0.019),
+                        rng.uniform(1.0, 1.4)) for name in task.objects}  # fmt: skip
 
 
 @dataclass(frozen=True)

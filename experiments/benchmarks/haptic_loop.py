@@ -31,7 +31,7 @@ from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.jaxconfig import configure
 from simgap.world.properties import PAPER_BLOCKS
-from simgap.world.simulate import simulate_trial
+from simgap.world.simulate import simulate_trials
 from simgap.world.virtual_model import (
     Surroundings,
     VirtualModel,
@@ -49,7 +49,7 @@ HAND_STIFFNESS, SQUEEZE = 150.0, 0.01  # N/m and m: the operator closes by 1.5 N
 
 def measure_rate(seconds: float, paced: bool, rate: float = 4000.0) -> dict[str, float]:
     """Times of all steps [us] over `seconds` at a rate, and the growth of memory [bytes]."""
-    done = simulate_trial(TASK, Rig(fingertip=PADS), PAPER_BLOCKS, seed=0)
+    done = simulate_trials(TASK, Rig(fingertip=PADS), [PAPER_BLOCKS], [0])[0]
     places = {name: float(done.motion.blocks[0, k, 0]) for k, name in enumerate(TASK.objects)}
     model = VirtualModel(Rig(fingertip=PADS), TASK, PAPER_BLOCKS, places)
     t = np.arange(0, done.t[-1], 1 / rate)
