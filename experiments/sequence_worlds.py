@@ -99,7 +99,7 @@ def abrupt(seed: int) -> World:
 
 
 def _phases(rng: np.random.Generator) -> np.ndarray:
-    """Shares of a state's duration that its phases take; mostly one."""
+    """Shares of a state's duration for its phases; mostly one."""
     return rng.dirichlet(np.full(rng.choice([1, 2, 3], p=[0.5, 0.3, 0.2]), 3.0))
 
 
