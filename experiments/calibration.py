@@ -1,4 +1,4 @@
-"""Are the uncertainties true? Boundaries and properties against the truth of many cases.
+"""Calibration of the uncertainties: boundaries and properties against the truth of many cases.
 
     python -m experiments.calibration [RECORDINGS] [--cases 64]
 
@@ -196,7 +196,7 @@ def headline(found: dict) -> str | None:
 
 
 def results(found: dict, speed: dict) -> str | None:
-    """docs/results.md: what was measured on two kinds of recordings; the paper's numbers below."""
+    """docs/results.md: errors and coverage on two kinds of recordings, with the paper's errors below."""
     if "recordings" not in found:
         return None
     columns = [found["recordings"]["pooled"], found["bank"]["pooled"]]

@@ -1,4 +1,4 @@
-"""Do intervals hold wherever the tool is used? Properties and boundaries in worlds that differ, a row each.
+"""Coverage of intervals for properties and boundaries in different worlds, a row each.
 
     python -m experiments.calibration_worlds [--rows NAME...] [--replicates 16] [--fresh]
 
@@ -124,7 +124,7 @@ def clustered(inside: Sequence[np.ndarray]) -> tuple[float | None, float | None]
 
 
 def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
-    """A panel for each level, a line for each world; grey is what is to be reached."""
+    """Draw a panel for each level and a line for each world; the goal is grey."""
     with panels(path, 1, 3, figsize=(10, 0.26 * len(rows) + 1.2), sharey=True) as axes:
         names = list(rows)
         for ax, (key, title, (low, high)) in zip(axes, PANELS, strict=True):

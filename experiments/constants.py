@@ -1,4 +1,4 @@
-"""Every numeric constant with its kind and reason, from its comment, into docs/tables/constants.csv.
+"""Write every numeric constant with its kind and reason, from its comment, to docs/tables/constants.csv.
 
     python -m experiments.constants
 

@@ -1,4 +1,4 @@
-"""Hostile input to every reader and command, in process: one line of InputError, or a result; nothing else.
+"""Hostile input to every reader and command, in process: each must give a result or a one-line InputError.
 
     python -m experiments.fuzz [--cases 100000] [--seed 0] [--commands 0.02] [--keep FOLDER]
 
@@ -101,7 +101,7 @@ def _command(scene: Scene, path: Path, command: list[str]) -> str:
 
 @contextlib.contextmanager
 def _standard_input(path: Path) -> Iterator[None]:
-    """A file in the place of standard input."""
+    """Replace standard input by a file."""
     usual = sys.stdin
     with path.open("rb") as file:
         sys.stdin = io.TextIOWrapper(io.BytesIO(file.read()))

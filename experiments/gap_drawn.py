@@ -79,7 +79,7 @@ def confidence(found: dict[str, Any]) -> float | None:
 
 
 def is_right(r: dict[str, Any]) -> bool:
-    """Whether a verdict is the label."""
+    """Whether a verdict agrees with the label."""
     return r["outcome"] in ("quiet", "named") or (r["tier"], r["outcome"]) == ("outside", "unknown")
 
 

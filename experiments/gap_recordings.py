@@ -29,7 +29,7 @@ TRIALS = 4
 
 
 def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dict[str, Any]:
-    """What one diagnosis found, and the processor and wall seconds it took."""
+    """Summary of a diagnosis, with its processor and wall time [s]."""
     actual = read_actual(folder / "actual.toml", case.task.objects) if measured else None
     start, busy = time.perf_counter(), time.process_time()
     aligned = align(case.trials[:TRIALS], case.task, case.rig)

@@ -38,7 +38,7 @@ BIAS, WIDER = 0.02, 3e-5  # of one sd of two deviations: a bias of force [N], a 
 
 
 def design_of(blocks: int, trials: int, rng: np.random.Generator) -> Design:
-    """One grip a block and trial, each with its means and slopes; the data are still to be drawn."""
+    """A design with one grip per block and trial, with means and slopes but without data."""
     unknowns = tuple(Unknown(prop, {f"b{k}": 1}) for k in range(blocks) for prop in PROPERTIES)
     rows = [(t, m, c, s) for s in (0, 1) for t in range(trials) for m in range(blocks) for c in range(3)
             if s == 0 or c > 0]  # fmt: skip
@@ -68,7 +68,7 @@ def _unread(trial: Any, rig: Any, size: float) -> Any:
 
 
 def drawn(design: Design, rng: np.random.Generator) -> tuple[Design, np.ndarray]:
-    """The design with data drawn from the model, and the properties (Q,) they were drawn of."""
+    """The design with data drawn from the model, and the true properties (Q,)."""
     d = design
     mean, sd = priors.property_priors([(u.name[0], u.prop) for u in d.unknowns])
     true = np.exp(mean + sd * rng.normal(size=mean.size))

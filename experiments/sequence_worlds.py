@@ -1,8 +1,8 @@
 """Plain sequences of many kinds, drawn at random, with their true boundaries.
 
-What makes real ones hard is in them: coloured and heavy-tailed noise, drifts, transients after an event,
-states nearly alike, states with phases of their own that nobody named, something that settles after the
-last event, trials cropped at their start, channels that tell nothing.
+They contain the difficulties of real recordings: coloured and heavy-tailed noise, drifts, transients after
+events, nearly equal states, states with unnamed phases of their own, settling after the last event, trials
+cropped at their start, and uninformative channels.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def abrupt(seed: int) -> World:
 
 
 def _phases(rng: np.random.Generator) -> np.ndarray:
-    """Shares of a state's duration that its phases take; mostly one."""
+    """Shares of a state's duration for its phases; mostly one."""
     return rng.dirichlet(np.full(rng.choice([1, 2, 3], p=[0.5, 0.3, 0.2]), 3.0))
 
 

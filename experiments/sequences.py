@@ -1,4 +1,4 @@
-"""Plain sequences without labels: are places and probabilities honest, and what does one label do?
+"""Plain sequences without labels: accuracy and calibration of boundaries, and the effect of one label.
 
     python -m experiments.sequences check [--worlds N] [--seed S] [--real FOLDER] [--panda FOLDER]
     python -m experiments.sequences learn [--worlds N] [--seed S]
@@ -41,7 +41,7 @@ BINS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95, 1.01)
 
 @dataclass(frozen=True)
 class Case:
-    """Trials with true boundaries; `scored`: which of them the truth is known of."""
+    """Trials with true boundaries; `scored` are the indices of the known ones."""
 
     name: str
     group: str
@@ -50,7 +50,7 @@ class Case:
 
 
 def drawn(first: int, count: int) -> list[Case]:
-    """Fresh worlds, of many kinds and of abrupt changes alone."""
+    """Newly drawn worlds: of many kinds, and with abrupt changes only."""
     cases = []
     for group, make in (("drawn", draw), ("abrupt", abrupt)):
         for seed in range(first, first + count):
@@ -90,7 +90,7 @@ def wrists(folder: Path) -> list[Case]:
 
 
 def hands(folders: list[Path]) -> list[Case]:
-    """A two-finger hand's recordings of blocks, by all their channels as they come, four trials of each."""
+    """Block recordings of a two-finger hand, with all their raw channels, four trials of each."""
     cases = []
     for each in folders:
         files = sorted(each.glob("trial_*.csv"))[:MOST_TRIALS]
@@ -103,7 +103,7 @@ def hands(folders: list[Path]) -> list[Case]:
 
 
 def answers(case: Case) -> dict:
-    """Scores without labels, with the one label that was suggested, with one labelled trial."""
+    """Scores without labels, with the one suggested label, and with one labelled trial."""
     world = case.world
     model = fit_sequence(world.trials, world.task)
     blind = segment_sequence(world.trials, world.task, model)
@@ -153,7 +153,7 @@ def score(case: Case, found: list[Segmentation], without: int | None = None) -> 
 
 
 def summary(scores: list[dict]) -> dict:
-    """Over all boundaries of some cases."""
+    """Summary over all boundaries of some cases."""
     rows = [row for each in scores for row in each["boundaries"]]
     if not rows:
         return {}
@@ -208,7 +208,7 @@ def check(cases: list[Case]) -> dict:
 
 
 def table(found: dict) -> str:
-    """A row for each group of cases and what was known; draws the figure."""
+    """A row for each group of cases and kind of labels; draws the figure."""
     rows = []
     for group, entry in found["groups"].items():
         for key, label in ROWS.items():

@@ -1,4 +1,4 @@
-"""Panels over time, and pictures of fingers and blocks, as several of the paper's figures need them."""
+"""Panels over time and pictures of fingers and blocks, shared by several of the paper's figures."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def thresholds(ax: Axes) -> None:
 
 
 def only(values: Sequence[float], chosen: Sequence[int]) -> np.ndarray:
-    """Values where chosen, NaN elsewhere, so that lines break."""
+    """Values where `chosen`, else NaN, so that lines break."""
     return np.where(np.asarray(chosen, bool), np.array(values, float), np.nan)
 
 

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 import tomlkit
-from tomlkit.items import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from simgap.effects import catalogue, effect_named
-from simgap.effects.base import KINEMATICS, Performance
+from simgap.effects.base import KINEMATICS, Performance, interval_comment, number, table
 from simgap.gap.twins import altered, carried, recorded, scene_of
 from simgap.gap.twins import performed as perform
 from simgap.world.dynamics import interpolated
@@ -28,27 +27,6 @@ from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.replay import Replay, replay
 from simgap.world.simulate import SimulatedTrial, simulate_trials
-
-
-def table(document: tomlkit.TOMLDocument, name: str) -> Table:
-    """A table of a document, appended if missing."""
-    if name not in document:
-        document.add(tomlkit.nl())
-        document.add(name, tomlkit.table(name == "effects"))
-    return document[name]  # type: ignore[return-value]
-
-
-def number(value: float) -> float:
-    """The value rounded to what a diagnosis can resolve."""
-    return float(f"{value:.6g}")
-
-
-def interval_comment(p: Mapping[str, Any]) -> str:
-    """A parameter's interval as a comment."""
-    low, high = p["interval_90"]
-    unit = "" if p["unit"] == "1" else f" {p['unit']}"
-    return "interval unknown" if None in (low, high) else f"90 % interval {low:.4g} to {high:.4g}{unit}"
-
 
 Body = Mapping[str, Any]
 FORMAT = "hmmseg.ranges/1"

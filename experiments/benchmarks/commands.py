@@ -1,4 +1,4 @@
-"""Where the time of a command goes: stages of `segment` and `identify`, and whole commands, processor time.
+"""Processor time of the stages of `segment` and `identify`, and of whole commands.
 
     python -m experiments.benchmarks.commands RECORDING_FOLDER
 

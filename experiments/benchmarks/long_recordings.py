@@ -3,10 +3,9 @@
     python -m experiments.benchmarks.long_recordings LAB
 
 LAB holds rig.toml and task.toml; its virtual model performs the task once at 1 kHz, and this round is
-recorded again and again. Each length and kind of
-file is written piece by piece and segmented by a process of its own, whose peak memory includes Python and
-all libraries; up to a length that memory allows, the same in one piece, with the answers compared. Writes
-experiments/results/benchmark_long.json.
+repeated. Each length and kind of file is written piece by piece and segmented in a separate process, whose
+peak memory includes Python and all libraries; where memory allows, the same is done in one piece and the
+answers compared. Writes experiments/results/benchmark_long.json.
 """
 
 from __future__ import annotations

@@ -4,8 +4,7 @@
 
 FOLDERs hold cases (rig.toml, task.toml, trial_*.csv, truth/). Writes experiments/results/watch.json and
 docs/figures/watch_lag.png. Ten minutes at 1 kHz are the fastest case's rows, performed again and again
-(`repeat`), so that the stream is as a real one is. Times are of the processor, rows parsed and lines written
-included.
+(`repeat`), as a real stream would be. Processor times include parsing rows and writing lines.
 """
 
 from __future__ import annotations
@@ -84,7 +83,7 @@ def timing(case: Path) -> dict:
 
 
 def boundaries(case: Path, file: Path, lag: float) -> tuple[list, bool, bool]:
-    """Settled boundaries (t, sd), whether any row before the end was reported as not fitting, and the last
+    """Settled boundaries (t, sd), whether an earlier row was reported as not fitting, and the last
     verdict."""
     watcher, alarm = Watcher(case / "task.toml", case / "rig.toml", lag), False
     for t, row in zip(*rows_of(case, file), strict=True):

@@ -48,7 +48,7 @@ HOLDS = 2.2  # a block is no heavier than this times the pads' friction, N: or i
 
 @dataclass(frozen=True)
 class Case:
-    """What a case is: tier, world, blocks, and its effects' values by name, each with its size (0 to 1)."""
+    """A case: tier, world, blocks, and the values and size (0 to 1) of each effect by name."""
 
     name: str
     seed: int
@@ -75,7 +75,7 @@ class Recorded:
 
 
 def tiers(count: int, shares: Mapping[str, int] = TIERS) -> list[str]:
-    """The tier of every case: shares kept at any number, spread over the whole set."""
+    """The tier of every case: shares hold for any number of cases, spread over the whole set."""
     names, weights = list(shares), np.array(list(shares.values()), float)
     given, out = np.zeros(len(names)), []
     for k in range(count):

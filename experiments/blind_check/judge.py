@@ -162,7 +162,7 @@ def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
 
 
 def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
-    """Probability that each effect acts, and whether it does; of outside cases nothing is known."""
+    """Probability that each effect acts, and whether it does; empty for outside cases."""
     if entry["tier"] in ("outside", "withheld"):
         return []
     acting = found.get("attribution") or {}

@@ -1,4 +1,4 @@
-"""A person's paths for any task of blocks, as knots that motions of some profile join.
+"""A person's paths for any task of blocks: knots joined by motions of a given profile.
 
 Every length, duration and force is drawn for each trial; profile and servo are the lab's.
 """
@@ -28,7 +28,7 @@ def _quintic(s: np.ndarray) -> np.ndarray:
 
 
 def trapezoid(rng: np.random.Generator) -> Profile:
-    """A machine's: constant acceleration, plateau, constant deceleration, of unequal shares."""
+    """A machine's profile: constant acceleration, plateau and constant deceleration, of unequal shares."""
     rise, fall = rng.uniform(0.15, 0.4, 2)
     top = 1 / (1 - (rise + fall) / 2)
 
@@ -43,7 +43,7 @@ def trapezoid(rng: np.random.Generator) -> Profile:
 
 
 def person(rng: np.random.Generator) -> Profile:
-    """Skewed towards its start, with a later correction of what the first motion fell short or over.
+    """A person's profile, skewed towards the start, with a later correction of the first motion's error.
 
     A lognormal speed (Plamondon, Biol. Cybern. 72, 1995) drawn to its end by a minimum-jerk correction
     (Flash & Henis, J. Cogn. Neurosci. 3, 1991).
@@ -286,7 +286,7 @@ def _move(k: Knots, block: Block, start, end, top: float, world: World, stiffnes
 
 
 def _rolled(k: Knots, t: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
-    """Roll (n,) [rad] of the hand while it carries, rms `size`; none as it grips and lets go."""
+    """Roll (n,) [rad] of the hand while it carries, of rms `size`; none during grip and release."""
     if not size:
         return np.zeros_like(t)
     out, weight = _shake(t, 0.3, 1.2, 1.0, rng), np.zeros_like(t)

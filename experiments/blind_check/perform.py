@@ -184,7 +184,7 @@ def _last(what: np.ndarray, start: int, end: int) -> int:
 
 
 def _lifted(stands: np.ndarray, touching: np.ndarray, height: np.ndarray, start: int) -> int:
-    """A sample of the flight: held, off the support and above it by more than tremor makes.
+    """A sample of the flight: held, off the support, and above it by more than tremor.
 
     A hand that wanders may lift a gripped block by a hair and set it down again before it carries it.
     """

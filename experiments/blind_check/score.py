@@ -1,4 +1,4 @@
-"""The separate scorer: opens the seal, checks the hash, compares, writes every figure of the goals."""
+"""The separate scorer: opens the seal, checks the hash, and computes every figure of the goals."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def score(folder: Path, results: Path, ranges: Sequence[tuple[int, int]] = ()) -
 
 
 def figures(rows: Sequence[Row]) -> dict[str, Any]:
-    """The table of the goals on all worlds pooled, by bracket, by size and effect, and the rows."""
+    """The figures of the goals over all worlds, by bracket, by size and by effect, and the rows."""
     tiers = list(dict.fromkeys(r["tier"] for r in rows))
     return {
         "cases": {t: sum(r["tier"] == t for r in rows) for t in tiers},

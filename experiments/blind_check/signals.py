@@ -37,7 +37,7 @@ class Signals:
         return self.motion.t
 
     def with_joints(self) -> Signals:
-        """Angles settled from the true tips."""
+        """The signals with joint angles computed from the true tips."""
         q = angles(self.rig, self.motion.position, self.stretch)
         return replace(self, q=q, dq=rates(self.rig, q, self.motion.velocity, self.stretch))
 
@@ -60,7 +60,7 @@ class Sampling:
 
 
 def sense(motion: Motion, rig: Rig, stages: Sequence[tuple[int, Stage]], rng: np.random.Generator) -> Signals:
-    """All stages in order, without noise."""
+    """Apply all stages in order, without noise."""
     out = Signals(motion, rig, motion.force.copy())
     ordered = sorted(stages, key=lambda s: s[0])
     for order, stage in ordered:
@@ -96,13 +96,13 @@ def sample(
 
 
 def _coloured(white: np.ndarray, keep: float) -> np.ndarray:
-    """White noise (n, c) made a stationary AR(1) of unit size."""
+    """White noise (n, c) turned into a stationary AR(1) of unit variance."""
     drive = np.concatenate([white[:1], np.sqrt(1 - keep**2) * white[1:]])
     return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=0))
 
 
 def task_space(rig: Rig, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Channels that a diagnosis speaks of, as the nominal hand has them."""
+    """The diagnosis's channels as computed with the nominal hand."""
     q = np.stack([columns[c] for c in ("q11", "q12", "q21", "q22")], 1)
     dq = np.stack([columns[c] for c in ("dq11", "dq12", "dq21", "dq22")], 1)
     p = tips(rig, q)

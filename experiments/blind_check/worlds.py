@@ -1,4 +1,4 @@
-"""Worlds: drawn circumstances under which a healthy recording is made, as labs differ.
+"""Worlds: circumstances of healthy recordings, drawn as labs differ.
 
 Rates, paces, pads, sensors (better, worse and coloured otherwise than stated), operators, servos, feet of
 blocks, pads that turn, fingers that close one after the other, small errors within what the rig states
@@ -111,7 +111,7 @@ def _third(value: float, low: float, high: float) -> str:
 
 
 def draw_world(rng: np.random.Generator, fastest: float = float("inf")) -> Circumstances:
-    """A lab: all circumstances drawn, most of them a little, some far off; rates up to `fastest` [Hz]."""
+    """Draw a lab: most circumstances differ a little, some a lot; rates are at most `fastest` [Hz]."""
     u = rng.uniform
     pads = _log(rng, 2000, 8000)
     common = u(0.8, 1.3)

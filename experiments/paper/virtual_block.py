@@ -21,7 +21,7 @@ from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import label_states, segment_qualitative
 from simgap.world.properties import UNITS, Block, Blocks
 from simgap.world.replay import replay, residual_summary
-from simgap.world.simulate import simulate_trial
+from simgap.world.simulate import simulate_trials
 
 TWICE = BlockTask({"block2": GROUND}, (Move("block2", GROUND), Move("block2", GROUND)))
 SEED = 0
@@ -85,7 +85,7 @@ def main() -> None:
     case = recorded()
     blocks = calibrated(identified(case))
     save_replays(case, blocks)
-    simulated = simulate_trial(TWICE, case.rig, {"block2": blocks["block2"]}, SEED)
+    simulated = simulate_trials(TWICE, case.rig, [{"block2": blocks["block2"]}], [SEED])[0]
     signals = task_space(simulated.trial, case.rig)
     virtual = shown(signals, segment_qualitative(simulated.trial, signals, TWICE))
     first = virtual["carries"][0]

@@ -186,6 +186,6 @@ def drawn(robot: Robot, world: World, kind: str, rng: np.random.Generator) -> Fa
     joint = robot.driven[actuator][0]
     thing = {JOINT: joint, ACTUATOR: actuator, READ: joint, WHOLE: ""}[found.on]
     names = {"j": joint, "a": actuator, "b": _body(world, joint)}
-    # Where one joint is all that is read and driven, a log that is late is one of a command that is.
+    # With a single joint, a late reading is equivalent to a late command.
     late = ("command.delay",) if kind == "read_lag" and len(robot.read) == 1 else ()
     return Fault(kind, thing, size, (*(r.format(**names) for r in found.right), *late))

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import tomlkit
+from tomlkit.items import Table
 
 from hmmseg.hand.kinematics import turning
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -226,6 +228,29 @@ def flat(performance: Performance) -> np.ndarray:
 def with_force(performance: Performance, force: np.ndarray) -> Performance:
     """The performance with other forces (n, 4) [N]."""
     return performance._replace(force=force.reshape(-1, 2, 2))
+
+
+# How effects write what was found into a rig.toml.
+
+
+def table(document: tomlkit.TOMLDocument, name: str) -> Table:
+    """A table of a document, appended if missing."""
+    if name not in document:
+        document.add(tomlkit.nl())
+        document.add(name, tomlkit.table(name == "effects"))
+    return document[name]  # type: ignore[return-value]
+
+
+def number(value: float) -> float:
+    """The value rounded to what a diagnosis can resolve."""
+    return float(f"{value:.6g}")
+
+
+def interval_comment(p: Mapping[str, Any]) -> str:
+    """A parameter's interval as a comment."""
+    low, high = p["interval_90"]
+    unit = "" if p["unit"] == "1" else f" {p['unit']}"
+    return "interval unknown" if None in (low, high) else f"90 % interval {low:.4g} to {high:.4g}{unit}"
 
 
 # Families of effects: each function gives an effect both its `correct` and its `apply`.

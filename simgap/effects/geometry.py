@@ -10,7 +10,16 @@ from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
 from simgap import channels
 from simgap.effect import Parameter
-from simgap.effects.base import KINEMATICS, DeadBand, HandEffect, Performance, World, gradient
+from simgap.effects.base import (
+    KINEMATICS,
+    DeadBand,
+    HandEffect,
+    Performance,
+    World,
+    gradient,
+    interval_comment,
+    number,
+)
 from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
@@ -59,8 +68,6 @@ def moved_joints(p: Performance, values, change) -> Performance:
 def _patched_link_length(document, found):
     """Put link lengths into the rig: all longer by `scale`, or each by its own share (link11: finger 1's
     first)."""
-    from simgap.patch import interval_comment, number
-
     if "fingers" not in document:
         return None
     common = found["scale"]["mean"] if "scale" in found else 0.0

@@ -16,6 +16,9 @@ from simgap.effects.base import (
     Performance,
     World,
     flat,
+    interval_comment,
+    number,
+    table,
     with_mode,
 )
 
@@ -60,8 +63,6 @@ def _phrase_fingertip_compliance(means, rig):
 
 def _patched_fingertip_compliance(document, found):
     """Put pad stiffnesses into the rig, each with its former value and comment."""
-    from simgap.patch import interval_comment, number, table
-
     pads = table(document, "fingertip")
     names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]
     for name in names:

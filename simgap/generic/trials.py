@@ -95,8 +95,7 @@ def align(
         task: Their task.
         model: Emissions and durations. By default they are learned from all trials together, each channel
             standardised within its kind so that a bias or gain between the kinds displaces no boundary.
-        boundaries: Boundaries [s] by file that replace the HMM's: one fewer than subtasks, or as many, with
-            the end of what is compared.
+        boundaries: Boundaries [s] between the subtasks, by file, that replace the HMM's.
 
     Returns:
         The cut trials; those that do not fit the task are left out, with a warning.
@@ -149,8 +148,7 @@ def align_block_trials(real: Sequence[Trial], sim: Sequence[Trial], task: BlockT
 
 def _edges(trial: Trial, inner: np.ndarray, task: SequenceTask) -> np.ndarray:
     """Edges (K + 1,) [s] of the subtasks from the boundaries that are given for a trial."""
-    whole = len(inner) == len(task.sequence)  # the end of what is compared is given, too
-    edges = np.concatenate([trial.t[:1], np.asarray(inner, float), [] if whole else trial.t[-1:]])
+    edges = np.concatenate([trial.t[:1], np.asarray(inner, float), trial.t[-1:]])
     if edges.size != len(task.sequence) + 1 or not (np.diff(edges) > 0).all():
         raise InputError(f"boundaries of {trial.file}", f"found {np.asarray(inner).tolist()}",
                          f"{len(task.sequence) - 1} increasing times within the trial")  # fmt: skip

@@ -19,13 +19,13 @@ def plain_name(
     effect: str, means: Mapping[str, float] | None = None, rig: Mapping[str, Any] | None = None
 ) -> str:
     """Effects joined by +, in plain words; `means` are their parameters, `rig` the model's pads."""
-    return " and ".join(_one(name, means or {}, rig or {}) for name in effect.split("+"))
-
-
-def _one(name: str, means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
-    called, _, effect = _words(name)
-    own = {k.removeprefix(f"{name}."): v for k, v in means.items()}
-    return effect.phrase(own, rig) if own and effect is not None and effect.phrase is not None else called
+    texts = []
+    for name in effect.split("+"):
+        called, _, known = _words(name)
+        if means and known is not None and known.phrase is not None:
+            called = known.phrase({k.removeprefix(f"{name}."): v for k, v in means.items()}, rig or {})
+        texts.append(called)
+    return " and ".join(texts)
 
 
 def checks(effects: Sequence[str]) -> list[str]:

@@ -59,16 +59,6 @@ def blocks_table(blocks: Blocks) -> Table:
     return listed("blocks", ("block", "weight", "width", "height", "friction"), rows)
 
 
-def random_properties(task: BlockTask, seed: int) -> dict[str, Block]:
-    """Draw blocks for every object of a task from what two fingers can handle.
-
-    Uniform: weights 0.25-0.65 N, widths 14-29 mm, heights 12-19 mm, friction 1.0-1.4.
-    """
-    rng = np.random.default_rng([seed, 1])
-    return {name: Block(rng.uniform(0.25, 0.65), rng.uniform(0.014, 0.029), rng.uniform(0.012, 0.019),
-                        rng.uniform(1.0, 1.4)) for name in task.objects}  # fmt: skip
-
-
 def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
     """Read blocks from an `actual.toml` or from the JSON of `identify`; InputError if invalid.
 

@@ -131,25 +131,16 @@ class SimulatedTrial(Tabled):
         return self.segmentation.plot(path)
 
 
-def simulate_trial(task: BlockTask, rig: Rig, properties: Blocks, seed: int,
-                   operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
-                   ) -> SimulatedTrial:  # fmt: skip
-    """One performance of a task with blocks of known properties, drawn from `seed`.
-
-    InputError if a block is missing or out of the hand's reach.
-    """
-    return simulate_trials(task, rig, [properties], [seed], operator, surroundings)[0]
-
-
 @double_precision
 def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], seeds: Sequence[int],
                     operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
                     alter: Callable[[Plan, np.random.Generator], Plan] | None = None,
                     ) -> list[SimulatedTrial]:  # fmt: skip
-    """Several performances at once, one for each seed and its blocks, each as by `simulate_trial`.
+    """Several performances of a task, one for each seed with its blocks of known properties.
 
-    They are integrated together, which costs far less than one after another. `alter` changes the operator's
-    commands, given a random generator of its own.
+    They are integrated together, which costs far less than one after another, with the same result. `alter`
+    changes the operator's commands, given a random generator of its own. InputError if a block is missing or
+    out of the hand's reach.
     """
     settings = operator or OperatorSettings()
     if not seeds:
