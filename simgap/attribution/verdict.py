@@ -66,6 +66,7 @@ def conclude(
     forced: tuple[str, ...] = (),
     chosen: tuple[str, ...] | None = None,
     unseen: float = 0.0,
+    record: float = RECORD,
 ) -> Verdict:
     """Read the verdict on a gap off a posterior over sets of effects.
 
@@ -76,12 +77,13 @@ def conclude(
         forced: causes given beforehand.
         chosen: causes that other data chose, in place of the likeliest.
         unseen: probability of a gap where there is no alarm.
+        record: how often a set that explains a gap is right, over its probability.
 
     Returns:
         The verdict; its probabilities are calibrated.
     """
     within = probabilities(sets, p_value if matters else 1.0)
-    probability = calibrated(within, unseen)
+    probability = calibrated(within, unseen, record)
     if forced:
         return Verdict("named", tuple(sorted(forced)), (), probability)
     if p_value >= ALARM or not matters:
@@ -92,15 +94,15 @@ def conclude(
     return Verdict("named", causes, (), probability).beside(alike(sets, causes))
 
 
-def calibrated(within: Mapping[str, float], unseen: float = 0.0) -> dict[str, float]:
+def calibrated(within: Mapping[str, float], unseen: float, record: float) -> dict[str, float]:
     """Probabilities as often right as they say, from those within the catalogue.
 
     A set that explains a gap is right as often as the method's record says, and a recording without an alarm
     may hide a gap with a probability of `unseen`; both leave their rest to `unknown`.
     """
-    out = {name: p * (1 - unseen if name == "none" else RECORD) for name, p in within.items()}
+    out = {name: p * (1 - unseen if name == "none" else record) for name, p in within.items()}
     out["unknown"] = 0.0
-    out["unknown"] = 1 - sum(out.values())
+    out["unknown"] = max(1 - sum(out.values()), 0.0)
     return out
 
 
