@@ -25,7 +25,7 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from hmmseg.hmm import durations, recursions
-from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
+from hmmseg.hmm.chain import Chain, not_a_number, why_infeasible
 from hmmseg.hmm.durations import DurationChain
 from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filtered, Posterior
 
@@ -241,11 +241,18 @@ def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
     ll = np.asarray(log_likelihoods, dtype=np.float64)
     _check_shape(ll, chain)
     missing = np.isnan(ll)
-    if missing.any():
-        partly = missing.any(1) & ~missing.all(1)
-        if partly.any():
-            raise not_numbers(ll, int(partly.argmax()))
+    partly = missing & ~missing.all(1, keepdims=True)
+    if partly.any():
+        raise not_a_number("log_likelihoods", partly, " (a missing sample is NaN throughout)")
     return ll
+
+
+def _failure(x: np.ndarray, chain: AnyChain) -> ValueError:
+    """The exception for a recording without a finite log weight."""
+    if np.isposinf(x).any():
+        return not_a_number("log_likelihoods", np.isposinf(x))
+    why = durations.why_infeasible if isinstance(chain, DurationChain) else why_infeasible
+    return why(x, chain)
 
 
 def _check_shape(ll: Any, chain: AnyChain) -> None:
@@ -313,8 +320,7 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any]
                 totals, batch = jax.tree.map(np.asarray, program(x, chain, n, *keys))
             for j, i in enumerate(part):
                 if not np.isfinite(totals[j]):
-                    why = durations.why_infeasible if isinstance(chains[i], DurationChain) else why_infeasible
-                    raise why(tables[i], chains[i])
+                    raise _failure(tables[i], chains[i])
                 results[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], batch), len(tables[i]))
     return results
 
