@@ -227,36 +227,22 @@ class PadDoubt:
         return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 
-def _softer_pads(fingers: tuple[int, ...], axis: str):
+def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads whose compliance is 1 + size of the nominal: their faces lie elsewhere under a force."""
+        """Pads whose compliance is 1 + size of the nominal, so that their faces lie elsewhere under a force.
+
+        With `usual`: pads that give as force^(1 + size), as the nominal at that force; to first order.
+        """
         signals, moved = task_space(trial, rig), {}
         for finger in fingers:
-            name = f"{axis}{finger}"
-            give = getattr(signals, f"f{name}") * _compliance(rig, finger, axis)
-            moved[name] = getattr(signals, name) - give * size
+            name = f"{'x' if kind == 'normal' else 'y'}{finger}"
+            law = getattr(signals, f"f{name}")
+            if usual is not None:
+                law = law * np.log(np.maximum(np.abs(law), 1e-3 * usual) / usual)
+            moved[name] = getattr(signals, name) - law * getattr(unit_pads(rig), f"{kind}{finger}") * size
         return replace(signals, **moved)
 
     return read
-
-
-def _bent_pads(axis: str, usual: float):
-    def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads that give as force^(1 + size), as the nominal at the force `usual`; to first order."""
-        signals, moved = task_space(trial, rig), {}
-        for finger in (1, 2):
-            name = f"{axis}{finger}"
-            force = getattr(signals, f"f{name}")
-            bend = force * np.log(np.maximum(np.abs(force), 1e-3 * usual) / usual)
-            moved[name] = getattr(signals, name) - _compliance(rig, finger, axis) * bend * size
-        return replace(signals, **moved)
-
-    return read
-
-
-def _compliance(rig: Rig, finger: int, axis: str) -> float:
-    """Of one pad [m/N]: along the grip (x) or in shear (y)."""
-    return getattr(unit_pads(rig), ("normal" if axis == "x" else "shear") + str(finger))
 
 
 def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
@@ -291,18 +277,18 @@ def nuisances(
     stated = min(max(doubts["normal"].extra_sd, *s.pad_stiffness) / np.log(2), MOST_BENT)
     # The pads of one hand are of one make, so most of the stated uncertainty of their stiffness is common.
     common = min(s.pad_stiffness) * np.sqrt(1 - UNLIKE**2)
-    for axis, (kind, doubt) in zip("xy", doubts.items(), strict=True):
+    for kind, doubt in doubts.items():
         bend = MOST_BENT * doubt.give or (stated if kind == "normal" else 0.0)
         admitted = 0.0 if doubt.give else common
         both = max(doubt.extra_sd, UNSTATED if doubt.give else 0.0)
         both = float(np.hypot(np.hypot(both, bend) if both else 0.0, admitted))
-        admit(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis))
+        admit(f"pad_{kind}", both, 1e-3, _other_pads(kind, (1, 2)))
         for finger in (1, 2):
             own = 0.0 if doubt.give else s.pad_stiffness[finger - 1]
             sd = np.sqrt(own**2 - admitted**2 + (UNLIKE * max(doubt.extra_sd, doubt.give)) ** 2)
-            admit(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis))
+            admit(f"pad_{kind}.{finger}", sd, 1e-3, _other_pads(kind, (finger,)))
         if any(n.name.startswith(f"pad_{kind}") for n in out):
-            admit(f"pad_{kind}_exponent", bend, 1e-3, _bent_pads(axis, max(doubt.usual, 1e-3)))
+            admit(f"pad_{kind}_exponent", bend, 1e-3, _other_pads(kind, (1, 2), max(doubt.usual, 1e-3)))
     admit("touch", touch_sd, 1e-5, _wider)
     return tuple(out)
 

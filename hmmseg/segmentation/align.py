@@ -22,14 +22,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.levels import decisive
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind
 from hmmseg.segmentation.changes import Change, discrepancies
-from hmmseg.segmentation.conformity import (
-    Conformity,
-    at,
-    examine,
-    explain,
-    plan,
-    task_boundaries,
-)
+from hmmseg.segmentation.conformity import Conformity, at, examine, explain, plan, task_boundaries
 from hmmseg.segmentation.emissions import WINDOW, Features, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import LEAD_SD, Sensing, read_again, sense

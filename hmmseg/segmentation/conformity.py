@@ -34,13 +34,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.levels import MOVED, SETTLING
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from hmmseg.segmentation.emissions import Features, Parameters
-from hmmseg.segmentation.free_contacts import (
-    RINGING,
-    Block,
-    FreeContacts,
-    fit_free_contacts,
-    switching,
-)
+from hmmseg.segmentation.free_contacts import RINGING, Block, FreeContacts, fit_free_contacts, switching
 
 DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
 STAGES = 3  # prior: most stages of the Erlang distribution of settling times
