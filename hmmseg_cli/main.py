@@ -10,10 +10,11 @@ import _thread
 import contextlib
 import gc
 import os
+import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -172,5 +173,12 @@ def _open_streams() -> None:
         sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: SIM115
 
 
+def run() -> NoReturn:
+    """Run the command line as a process, whose exit code no interrupt changes once all is written."""
+    code = main()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

@@ -212,7 +212,7 @@ def diagnose_robot(
     phases = None
     if task is not None:
         from hmmseg.io.task import read_task
-        from simgap.robots.phases import phases_by_task
+        from simgap.robots.rows import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
     with show_stages(out, "diagnosing", STAGES) as tell:

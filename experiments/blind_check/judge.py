@@ -1,4 +1,4 @@
-"""One case judged: what is true of it, what was said, whether that is right."""
+"""Judge a case: its truth, its diagnosis, and whether that is right."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from experiments.blind_check.effects import CATALOGUE
 FLOOR = 5.0  # nats that an effect gains, its parameters paid for
 AFFECTED = 3.0  # standard deviations of a sample
 VISIBLE = 1.0  # the same, rms over a cell, of an effect that is not fitted
-# What these recordings cannot tell from a withheld effect (gap-effects.md; * only without actual.toml).
+# Effects indistinguishable from a withheld one in these recordings (* only without actual.toml).
 PARTNERS = {
     "force_gain": ("fingertip_compliance*",),
     "fingertip_compliance": ("force_gain*",),
@@ -36,7 +36,7 @@ NOTHING: dict[str, Any] = {
 
 
 def label(entry: dict[str, Any]) -> str:
-    """The probability's name that ought to be large."""
+    """Name of the probability that should be largest."""
     if entry["tier"] in ("healthy", "slight"):
         return "none"
     if entry["tier"] in ("outside", "withheld"):
@@ -89,7 +89,7 @@ def true_parameters(entry: dict[str, Any]) -> dict[str, float]:
 
 
 def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
-    """A row of the results: the tables are made of rows alone."""
+    """The results' row for a case; tables are made from rows only."""
     failed = "error" in found
     if failed:
         found = {**NOTHING, "seconds": found["seconds"], "error": found["error"]}
@@ -133,24 +133,24 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _gain(entry: dict, found: dict) -> float | None:
-    """Nats that the true effects by themselves gain, the least of them; None where it was not fitted."""
+    """Smallest gain [nats] of the true effects, each alone; None if one was not fitted."""
     known = [found["gains"].get(n) for n in entry["effects"]]
     return None if not known or None in known else float(min(known))  # type: ignore[type-var]
 
 
 def _above(entry: dict, found: dict) -> bool:
-    """Whether each true effect can be seen: by what it gains, else by what it shifts."""
+    """Whether each true effect is detectable: by its gain if fitted, else by its shift."""
     gain = _gain(entry, found)
     return visible(entry) if gain is None else gain >= FLOOR
 
 
 def _stand_ins(entry: dict, found: dict) -> set[str]:
-    """Effects that may stand for a withheld one."""
+    """Effects accepted in place of a withheld one."""
     return partners(entry) if len(entry["effects"]) == 1 else set()
 
 
 def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
-    """Largest probability and whether it lies on what is true."""
+    """The largest probability, and whether it belongs to the truth."""
     known = {k: v for k, v in found["probabilities"].items() if k != "other"}
     if not known:
         return None
@@ -162,7 +162,7 @@ def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
 
 
 def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
-    """Probability that each effect acts, and whether it does; of outside cases nothing is known."""
+    """Probability that each effect acts, and whether it does; empty for outside cases."""
     if entry["tier"] in ("outside", "withheld"):
         return []
     acting = found.get("attribution") or {}
@@ -170,7 +170,7 @@ def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
 
 
 def intervals_hold(entry: dict, found: dict) -> dict[str, bool]:
-    """Whether the 90 % interval of each true effect's parameter holds its value, where it was named."""
+    """Whether the 90 % interval of each parameter of the named true effects contains its value."""
     got = {}
     for name in found["causes"]:
         for key in (name, "+".join(sorted(found["causes"]))):

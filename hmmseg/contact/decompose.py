@@ -1,11 +1,11 @@
-"""Task decomposition: from objects and moves to subtasks and the properties each can reveal.
+"""Task decomposition: from objects and moves to subtasks, and the properties each can reveal.
 
-A task is cut at each anticipated change of the active constraint set, whose constraints are those of the
-hand and of the object it manipulates: finger on object, object on its support. Each contact state gives
-quasistatic equations between measured signals and unknowns (planar statics of a rigid block between two
-fingertips). A property is determined when some combination of the equations of a subtask, alone or with
-another of the same move, leaves it as the only unknown, which exact elimination finds without tolerances.
-What no pair determines is sought in all moves together, as the heights in a tower of three are.
+A task is divided at each expected change of the active constraint set: the contacts of the fingers with the
+manipulated object, and of the object with its support. Each contact state gives quasistatic equations between
+measured signals and unknowns (planar statics of a rigid block between two fingertips). A property is
+determined if some combination of the equations of one subtask, or of two of the same move, isolates it as the
+only unknown, which exact elimination finds without tolerances. Properties that no pair determines are sought
+in all moves together, such as the heights in a tower of three.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ FINGERS = ("finger1", "finger2")
 
 @dataclass(frozen=True)
 class ContactState:
-    """The constraints of the hand and the object that it manipulates, between two changes of them.
+    """The constraints of the hand and the manipulated object, between two changes of them.
 
-    `name`: the state's; the paper calls every support the ground. `support`: what the held object touches
-    besides the fingers, None while free or lifted. `beneath`: objects from its support down to the ground.
-    `move`: 0-based index of the move.
+    `name`: of the contact state; the paper calls every support the ground. `support`: what the held object
+    touches besides the fingers, None while free or lifted. `beneath`: objects from its support down to the
+    ground. `move`: 0-based index of the move.
     """
 
     object: str
@@ -43,7 +43,7 @@ class ContactState:
 
     @property
     def held(self) -> bool:
-        """Whether the fingers are on the object."""
+        """Whether the fingers hold the object."""
         return self.name != FREE
 
     @property
@@ -56,7 +56,7 @@ class ContactState:
 
 
 def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
-    """Objects from what `name` stands on down to the ground, nearest first."""
+    """Objects from the support of `name` down to the ground, nearest first."""
     beneath, below = [], support[name]
     while below != GROUND:
         beneath.append(below)
@@ -65,9 +65,9 @@ def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
 
 
 def contact_states(task: BlockTask) -> Iterator[ContactState]:
-    """The task's contact states in order, one between every two changes of the constraint set.
+    """The task's contact states in order, separated by changes of the constraint set.
 
-    The hand closes on the object, breaks or slips its support contact, restores one at the
+    The hand closes on the object, breaks its support contact or slides it, restores contact at the
     destination, and opens.
     """
     support = dict(task.initial)
@@ -97,7 +97,7 @@ PROPERTIES = tuple(UNITS)
 
 @dataclass(frozen=True)
 class Source:
-    """A signal measured during a subtask (its index); `sample` counts the loads it was read at."""
+    """A signal measured during a subtask (its index); `sample` numbers the loads at which it was read."""
 
     subtask: int
     signal: str
@@ -110,7 +110,7 @@ Equation = Row[Unknown | Source]
 
 
 def reduced(rows: Iterable[Row[Key]], lead: Callable[[Row[Key]], Key | None]) -> dict[Key, Row[Key]]:
-    """Rows of the reduced row echelon form by their pivots, which `lead` chooses (None: a row has none)."""
+    """Rows of the reduced row echelon form by pivot, which `lead` chooses (None: no pivot in this row)."""
     pivots: dict[Key, Row[Key]] = {}
     for row in rows:
         for key in [key for key in row if key in pivots]:
@@ -137,11 +137,11 @@ def is_property(unknown: Unknown) -> bool:
 def balance(index: int, state: ContactState, loads: int = 1) -> list[Equation]:
     """Quasistatic equations of subtask `index`, at `loads` different vertical forces.
 
-    Geometry: the fingers' distance is the width; each finger is as high as the object's bottom
-    plus where it grips, which stays the same throughout one move. Forces: the fingers' net
-    vertical force is the weight less the support's load, their net horizontal force is the
-    support's push. Slipping: push = friction x load (Coulomb), linearised about given loads;
-    their values are arbitrary, distinct numbers, as only rank matters.
+    Geometry: the fingers' distance is the width; the height of each finger is that of the object's bottom
+    plus that of the grip on it, which is constant throughout one move. Forces: the fingers' net vertical
+    force is the weight less the support's load, their net horizontal force is the support's push. Slipping:
+    push = friction x load (Coulomb), linearised about given loads; their values are arbitrary, distinct
+    numbers, as only rank matters.
     """
     if not state.held:
         return []
@@ -166,15 +166,15 @@ def balance(index: int, state: ContactState, loads: int = 1) -> list[Equation]:
 
 
 def _equation(unknowns: Mapping[Unknown, int], measured: Source) -> Equation:
-    """That the unknowns, with these coefficients, sum to what is measured."""
+    """The equation that the unknowns, with these coefficients, sum to the measured signal."""
     return {key: Fraction(value) for key, value in unknowns.items()} | {measured: Fraction(-1)}
 
 
 def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> dict[Unknown, Row[Source]]:
     """Unknowns that the equations determine, each as a combination of sources.
 
-    An unknown is in the row space on its own exactly when its pivot row holds no other. `known` unknowns are
-    taken as given.
+    An unknown is in the row space on its own exactly if its pivot row contains no other. `known` unknowns are
+    given.
     """
 
     def unknown(row: Equation) -> list[Unknown]:
@@ -183,15 +183,15 @@ def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> 
     def lead(row: Equation) -> Unknown | None:
         return min(unknown(row), key=is_property, default=None)  # nuisances go first
 
-    given = set(known)
-    rows = ({key: value for key, value in row.items() if key not in given} for row in equations)
+    excluded = set(known)
+    rows = ({key: value for key, value in row.items() if key not in excluded} for row in equations)
     return {pivot: {key: -value for key, value in row.items() if isinstance(key, Source)}
             for pivot, row in reduced(rows, lead).items()
             if len(unknown(row)) == 1 and not isinstance(pivot, Source)}  # fmt: skip
 
 
 def labelled(subtask: str, obj: str | None) -> str:
-    """A subtask with its object, as `carry block1`; by its name alone where it has none."""
+    """A subtask with its object, such as `carry block1`; only its name if it has none."""
     return subtask if obj is None else f"{subtask} {obj}"
 
 
@@ -199,10 +199,9 @@ def labelled(subtask: str, obj: str | None) -> str:
 class Subtask:
     """One step of a task: its name, contact state and manipulated object.
 
-    `move` is the 0-based index in `task.performed` of the move it belongs to (None in a plain
-    ordered task); a pregrasp belongs to the first move, a release to the move it ends. `support`
-    is what the held object touches besides the fingers, None while free or lifted; `constraints`
-    are the active contacts of the hand and the held object.
+    `move`: 0-based index in `task.performed` of its move (None in a plain ordered task); a pregrasp belongs
+    to the first move, a release to the move it ends. `support`: what the held object touches besides the
+    fingers, None while free or lifted; `constraints`: active contacts of the hand and the held object.
     """
 
     index: int
@@ -215,17 +214,16 @@ class Subtask:
 
     @property
     def label(self) -> str:
-        """As the interface names it, as `carry block1`."""
+        """Its name in the interface, such as `carry block1`."""
         return labelled(self.name, self.object)
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One way to learn a property: the signals of the subtasks that are needed together.
+    """One way to learn a property: the signals of the subtasks required together.
 
-    `bound`: it gives a lower bound only (a friction coefficient without slip). `given` are
-    properties, determined elsewhere, that it takes as known. `condition`, where not None, says
-    what the recording must show besides.
+    `bound`: only a lower bound (a friction coefficient without slip). `given`: properties, determined
+    elsewhere, that are required. `condition`: what the recording must show in addition, if anything.
     """
 
     sources: tuple[Source, ...]
@@ -235,11 +233,11 @@ class Evidence:
 
     @property
     def subtasks(self) -> tuple[int, ...]:
-        """Indices of the subtasks needed, in order."""
+        """Indices of the required subtasks, in order."""
         return tuple(sorted({source.subtask for source in self.sources}))
 
     def signals(self, subtask: int | None = None) -> tuple[str, ...]:
-        """Names of the signals needed, of one subtask or of all."""
+        """Names of the required signals, of one subtask or of all."""
         wanted = (s.signal for s in self.sources if subtask in (None, s.subtask))
         return tuple(sorted(set(wanted)))
 
@@ -248,8 +246,8 @@ class Evidence:
 class Property:
     """A property of an object: every way to learn it, or the reason why there is none.
 
-    Any one of `evidence` is enough by itself, the strongest first. `name` is weight, width, height,
-    friction (of the fingers on the object) or friction_on_SUPPORT.
+    Each of `evidence` suffices by itself, the strongest first. `name` is weight, width, height, friction (of
+    the fingers on the object) or friction_on_SUPPORT.
     """
 
     object: str
@@ -259,7 +257,7 @@ class Property:
 
     @property
     def kind(self) -> str | None:
-        """ "value", "bound" where only a lower bound can be had, None where nothing can."""
+        """ "value", "bound" if only a lower bound is available, None if nothing is."""
         if not self.evidence:
             return None
         return "bound" if all(evidence.bound for evidence in self.evidence) else "value"
@@ -267,7 +265,7 @@ class Property:
 
 @dataclass(frozen=True, repr=False)
 class Decomposition(Tabled):
-    """A task's subtasks in order, and for each object's properties what reveals them."""
+    """A task's subtasks in order, and for each object the evidence for its properties."""
 
     task: AnyTask
     subtasks: tuple[Subtask, ...]
@@ -275,20 +273,20 @@ class Decomposition(Tabled):
     notes: tuple[str, ...] = ()
 
     def reveals(self, index: int) -> list[tuple[Property, Evidence]]:
-        """All that subtask `index` helps to reveal, by its first evidence for each property."""
-        found = []
+        """Properties that subtask `index` helps to reveal, each with its first such evidence."""
+        pairs = []
         for entry in (entry for entries in self.properties.values() for entry in entries.values()):
             evidence = next((e for e in entry.evidence if index in e.subtasks), None)
             if evidence is not None:
-                found.append((entry, evidence))
+                pairs.append((entry, evidence))
         order = (WEIGHT, WIDTH, HEIGHT, FRICTION)  # friction on a support comes last
-        return sorted(found, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
+        return sorted(pairs, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
 
     def in_paper(self, index: int, entry: Property) -> bool:
         """Whether the paper's Table 1 would list the property for this subtask.
 
-        It reads weight and width only while an object is held above the ground, and speaks of
-        friction with a support only in sliding contact (its Sections 2.1 and 3.2).
+        It reads weight and width only while an object is held above the ground, and mentions friction with a
+        support only in sliding contact (its Sections 2.1 and 3.2).
         """
         state = self.subtasks[index].state
         if entry.name in (WEIGHT, WIDTH):
@@ -336,7 +334,7 @@ def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
 
 
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
-    """For each performed move, how far its object's bottom rises, as a sum of object heights.
+    """For each performed move, the rise of its object's bottom as a sum of object heights.
 
     The paper's height of the block beneath (its Table 3) is the case of a single coefficient.
 
@@ -344,20 +342,18 @@ def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
         task: of blocks.
 
     Returns:
-        (0-based index of the move, {object: coefficient}) a move: bottom height at place minus bottom
-        height at pickup. A slide rises by nothing: {}.
+        (0-based index of the move, {object: coefficient}) per move: bottom height at place less that
+        at pickup. The rise of a slide is {}.
     """
-    states = list(contact_states(task))
-    equations = []
-    for index in range(len(task.performed)):
-        start, _, end = (state for state in states if state.held and state.move == index)
+    held, equations = [state for state in contact_states(task) if state.held], []
+    for start, _, end in zip(held[::3], held[1::3], held[2::3], strict=True):
         rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}
-        equations.append((index, {name: value for name, value in rise.items() if value}))
+        equations.append((start.move, {name: value for name, value in rise.items() if value}))
     return equations
 
 
 def decompose(task: AnyTask) -> Decomposition:
-    """Subtasks of a task and what each object's properties can be learned from."""
+    """Subtasks of a task, and how each object's properties can be learned."""
     if isinstance(task, SequenceTask):
         note = "a plain ordered task has no block physics: no properties"
         return Decomposition(task, subtasks(task), notes=(note,))
@@ -381,28 +377,25 @@ def decompose(task: AnyTask) -> Decomposition:
 def _learn(states: list[ContactState]) -> dict[Unknown, list[Evidence]]:
     """Every way to learn each property, from the contact states in order."""
     learned: dict[Unknown, list[Evidence]] = {}
-    moves: dict[object, list[list[int]]] = {}  # moves alike in all contacts determine alike
+    moves: dict[object, list[list[int]]] = {}  # moves with equal contacts determine equal properties
     for _, group in itertools.groupby((i for i, s in enumerate(states) if s.held), lambda i: states[i].move):
         indices = list(group)
-        moves.setdefault(tuple((states[i].constraints, states[i].beneath) for i in indices), []).append(
-            indices
-        )
+        contacts = tuple((states[i].constraints, states[i].beneath) for i in indices)
+        moves.setdefault(contacts, []).append(indices)
     for alike in moves.values():
         _learn_within(states, alike, learned)
     equations = [e for alike in moves.values() for i in alike[0] for e in balance(i, states[i])]
     for unknown, row in determined(equations).items():
         if unknown[0] in PROPERTIES:
             learned.setdefault(unknown, [_evidence(row)])
-    for alike in moves.values():
-        for indices in alike:
-            for index in indices:
-                _learn_friction(index, states[index], learned)
+    for index in itertools.chain.from_iterable(itertools.chain.from_iterable(moves.values())):
+        _learn_friction(index, states[index], learned)
     return learned
 
 
 def _learn_within(states: list[ContactState], alike: list[list[int]],
                   learned: dict[Unknown, list[Evidence]]) -> None:  # fmt: skip
-    """What one subtask of a move determines alone, and what only two of them do together."""
+    """What single subtasks of a move determine, and what only pairs of them do."""
     first, alone = alike[0], set()
     for size in (1, 2):
         for subset in itertools.combinations(first, size):
@@ -418,10 +411,10 @@ def _learn_within(states: list[ContactState], alike: list[list[int]],
 
 
 def _learn_friction(index: int, state: ContactState, learned: dict[Unknown, list[Evidence]]) -> None:
-    """Coefficients of the contacts of one state: known where the contact's forces are known.
+    """Friction at the contacts of one state, determined where the contact forces are known.
 
-    A fingertip's forces are measured; a support's follow from the balance once the weight is
-    given. Slip determines the coefficient, sticking bounds it from below.
+    A fingertip's forces are measured; a support's follow from the balance once the weight is given. Slip
+    determines the coefficient, sticking bounds it from below.
     """
     forces = (Source(index, X_FORCES), Source(index, Y_FORCES))
     learned.setdefault((FRICTION, state.object), []).append(Evidence(forces, bound=True))
@@ -431,13 +424,13 @@ def _learn_friction(index: int, state: ContactState, learned: dict[Unknown, list
     target = friction if state.name == SLIDING else ("load", str(index), "0")
     equations = balance(index, state)
     unknowns = {key for equation in equations for key in equation if not isinstance(key, Source)}
-    known = {key for key in unknowns if any(way.condition is None for way in learned.get(key, ()))}
-    known -= {friction}
-    if target in determined(equations, known):
-        given = tuple(u for u in known if target not in determined(equations, known - {u}))
-        learned.setdefault(friction, []).append(Evidence(forces, state.name != SLIDING, given))
+    given = {key for key in unknowns if any(way.condition is None for way in learned.get(key, ()))}
+    given -= {friction}
+    if target in determined(equations, given):
+        needed = tuple(u for u in given if target not in determined(equations, given - {u}))
+        learned.setdefault(friction, []).append(Evidence(forces, state.name != SLIDING, needed))
         return
-    for unknown, row in determined(balance(index, state, loads=3), known).items():
+    for unknown, row in determined(balance(index, state, loads=3), given).items():
         if is_property(unknown):
             learned.setdefault(unknown, []).append(_evidence(row, condition=VARYING_LOAD))
 

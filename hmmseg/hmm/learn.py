@@ -1,8 +1,8 @@
-"""Expectation maximisation of a task's hidden Markov model, trials of any lengths pooled.
+"""Expectation maximisation of a task's hidden Markov model, pooling trials of any lengths.
 
-What the states look like and how long they last is the caller's: the driver sees nothing but log-likelihoods
-(num_timesteps, num_states), chains, and posterior state probabilities of the same shape. A network's
-emissions need no driver: their gradient is that of `hmmseg.hmm.log_evidence` (docs/hmm.md).
+Emissions and durations are up to the caller: the driver handles only log-likelihoods (num_timesteps,
+num_states), chains, and posterior state probabilities of the same shape. Emissions by a network need no
+driver, as the gradient of `hmmseg.hmm.log_evidence` is available (docs/hmm.md).
 
 Dempster, Laird and Rubin, J. R. Stat. Soc. B 39, 1977; Rabiner, Proc. IEEE 77(2), 1989.
 """
@@ -25,12 +25,11 @@ LEAST_ITERATIONS = 6  # numerics: before the evidence may have settled
 
 @dataclass(frozen=True)
 class Learned(Generic[M]):
-    """A fitted model; every trial's most probable path and posterior are those under it."""
+    """A fitted model, with every trial's most probable path and posterior under it."""
 
     model: M
     alignments: tuple[AlignmentPosterior, ...]
-    num_iterations: int
-    converged: bool
+    converged: bool = False
 
     @property
     def log_evidence(self) -> float:
@@ -41,20 +40,20 @@ class Learned(Generic[M]):
 def em(model: M, tables: Callable[[M], tuple[Sequence[np.ndarray], Sequence[Chain]]],
        updated: Callable[[M, Sequence[np.ndarray]], M], max_iterations: int = 40,
        tolerance: float = 1e-3) -> Learned[M]:  # fmt: skip
-    """Expectation and maximisation in turn, until the log evidence changes by less than `tolerance` nats.
+    """Alternate expectation and maximisation until the log evidence changes by less than `tolerance` nats.
 
     The last step is an expectation.
 
     Args:
-        model: where it starts.
-        tables: of a model, each trial's log-likelihoods (num_timesteps, num_states), -inf where a state
-            cannot be, and its chain.
-        updated: the M-step: a model anew, given each trial's posterior state probabilities.
-        max_iterations: after which it ends unconverged.
+        model: initial model.
+        tables: maps a model to each trial's log-likelihoods (num_timesteps, num_states), -inf for impossible
+            states, and its chain.
+        updated: the M-step: a new model, given each trial's posterior state probabilities.
+        max_iterations: limit, after which the result is unconverged.
         tolerance: nats.
 
     Returns:
-        The model at the end.
+        The final model.
 
     Raises:
         InfeasibleAlignment: a trial is too short for its states.
@@ -62,9 +61,9 @@ def em(model: M, tables: Callable[[M], tuple[Sequence[np.ndarray], Sequence[Chai
     """
     before = -np.inf
     for iteration in range(1, max_iterations + 1):
-        fit = Learned(model, tuple(align(*tables(model))), iteration, False)
+        fit = Learned(model, tuple(align(*tables(model))))
         if iteration > LEAST_ITERATIONS and abs(fit.log_evidence - before) < tolerance:
-            return Learned(model, fit.alignments, iteration, True)
+            return Learned(model, fit.alignments, converged=True)
         if iteration < max_iterations:
             before = fit.log_evidence
             model = updated(model, [each.smoothed for each in fit.alignments])

@@ -331,8 +331,7 @@ def _held_out(
     after, fold = np.full(rows.log.size, np.nan), folds_of(rows, len(every), every)
     for number in np.unique(fold):
         mine = fold == number
-        seen = composed.along(np.unique(rows.log[~mine]).tolist())
-        point, _, _ = _least_squares(seen, found, AGAIN, free)
-        part = composed.along(np.unique(rows.log[mine]).tolist())
-        after[mine] = rows.observed[mine] - base_at(part, point).rows
+        train, test = (composed.among(np.unique(rows.window[m]).tolist()) for m in (~mine, mine))
+        point, _, _ = _least_squares(train, found, AGAIN, free)
+        after[mine] = rows.observed[mine] - base_at(test, point).rows
     return rows.rms(before), rows.rms(after)

@@ -49,6 +49,7 @@ from simgap.robots.fit import Local, descended
 from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import noises
+from simgap.robots.search import by_chance
 from simgap.robots.unchanged import (
     FAR,
     Broken,
@@ -300,15 +301,6 @@ def jackknife(strata: Sequence[np.ndarray], known: np.ndarray | float = 0.0) -> 
     total = each.sum(0) + known
     share = np.divide(each, total, out=np.ones_like(each), where=np.isfinite(total))
     return np.sqrt(total), 1 / np.sum(share**2 / np.array(freedom)[:, None], 0)
-
-
-def by_chance(gains: np.ndarray) -> float:
-    """How often as much is gained in the mean (M,) from motion to motion where there is nothing to gain: by
-    Student's t, one-sided."""
-    if gains.size < 2:
-        return 0.5
-    sd = max(float(gains.std(ddof=1)), 1e-12)
-    return float(student.sf(gains.mean() / sd * np.sqrt(gains.size), gains.size - 1))
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ class Block:
         return out
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Whitener:
     """Inverse lower Cholesky factors of blocks of rows, and by block half the log determinant of their
     covariance."""
@@ -351,7 +351,7 @@ def covariances(composed: Composed, linear: Linear) -> Covariances:
             moved = [linear.starts[n][rows] * doubt for n, doubt in composed.windows[number].doubt.items()]
             start = np.array(moved).reshape(-1, rows.size).T
             variance = linear.rows.variance[rows]
-            sources = _sources(linear, rows, kinds, free)
+            sources = _sources(composed, linear, rows, kinds)
             blocks.append(
                 Block(rows, number, variance, start, sources, linear.rows.channel[rows], repeats[number])
             )
@@ -374,8 +374,10 @@ CONTACTS = "contacts"  # a source whose s is how many usual sizes every effect i
 INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # physics: of an acceleration
 
 
-def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: bool) -> dict[str, Source]:
-    rows = linear.rows
+def _sources(
+    composed: Composed, linear: Linear, block: np.ndarray, kinds: Mapping[str, str]
+) -> dict[str, Source]:
+    rows, wobble = linear.rows, composed.wobble
     out: dict[str, Source] = {}
     since, channel, regime = rows.since[block], rows.channel[block], REGIMES[rows.regime[block[0]]]
     every = np.arange(since.size)
@@ -393,10 +395,10 @@ def _sources(linear: Linear, block: np.ndarray, kinds: Mapping[str, str], free: 
             forces = np.exp(-np.abs(t[:, None] - t) / TAU)
             out[key] = Source(moved, response[moved] @ forces @ response[moved].T)
         else:
-            times = INTEGRALS[kinds[name]] if free else 0
+            times = INTEGRALS[kinds[name]] if linear.starts else 0
             out[key] = Source(np.flatnonzero(mine), _integrated(t.tobytes(), times))
-    if linear.wobble is not None and regime == STRIKES:
-        out[CONTACTS] = Source(every, linear.wobble[block] @ linear.wobble[block].T)
+    if wobble is not None and regime == STRIKES:
+        out[CONTACTS] = Source(every, wobble[block] @ wobble[block].T)
     out[CLOCK] = Source(every, linear.rates[block] ** 2)
     return out
 

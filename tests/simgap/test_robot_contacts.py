@@ -7,8 +7,7 @@ from simgap.robot_effects import readouts
 from simgap.robot_effects.base import Setting
 from simgap.robots.linear import base_at, linearise, wobbling
 from simgap.robots.model import Composed
-from simgap.robots.phases import phases_of
-from simgap.robots.rows import rows_of
+from simgap.robots.rows import phases_of, rows_of
 from simgap.robots.whiten import CONTACTS, LIES, Discrepancy, covariances
 from simgap.robots.windows import AT_REST, FLIES, REGIMES, RESTS, STRIKES, cut, resting
 from simgap.simulators.protocol import Channel, Parameter

@@ -13,8 +13,7 @@ from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
-from simgap.robots.phases import phases_by_task
-from simgap.robots.rows import learned, noises, resolution, rows_of
+from simgap.robots.rows import learned, noises, phases_by_task, resolution, rows_of
 from simgap.robots.sets import identifiability
 from simgap.robots.whiten import NONE, covariances
 from simgap.robots.windows import REACH, smoothed
