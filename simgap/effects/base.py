@@ -141,7 +141,8 @@ class HandEffect(Effect):
     Where it is used: `chosen` is false for effects that only `--effect` requests. `wrist`: the first form
     shows in a wrist sensor. `played`: values that are felt in a played world, by default from the priors;
     empty if it cannot be felt. `turns`: the parameter [rad] up to which blocks turn freely in the grip on the
-    ground. `grip` [N]: least and largest grip with which the effect shows.
+    ground. `grip` [N]: least and largest grip with which the effect shows. `exact`: the equation is what
+    happens, as a zero error is an added constant, and no simplified model of it, as Coulomb friction is.
 
     Its words: `report(values, rig)` gives the parameters as the interface names them, `phrase(means, rig)`
     the effect in plain words where they depend on its parameters. `patched(document, found)` writes values
@@ -169,6 +170,7 @@ class HandEffect(Effect):
     patched: Callable[[Any, Mapping[str, Any]], dict[str, str] | None] | None = None
     wrong: Callable[[Any, np.ndarray], list[Any]] | None = None
     turns: str = ""
+    exact: bool = False
 
     @property
     def simulated(self) -> bool:
@@ -310,7 +312,7 @@ def mixing(matrix: Callable[[Values], Array], **more: Any) -> HandEffect:
     def apply(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
         return with_force(p, flat(p) @ matrix(values).T)
 
-    return HandEffect(correct=correct, apply=apply, **more)
+    return HandEffect(correct=correct, apply=apply, exact=True, **more)
 
 
 Spread = Callable[[Mapping[str, Array]], list[Theta]]  # from parameters to those of each force channel

@@ -83,6 +83,7 @@ def _patched_link_length(document, found):
 
 JOINT_OFFSET = HandEffect(
     name="joint_offset",
+    exact=True,
     acts_on="kinematics",
     says="recorded q = q + q0, per joint",
     shows="positions, widths, heights, by pose",
@@ -102,6 +103,7 @@ JOINT_OFFSET = HandEffect(
 
 LINK_LENGTH = HandEffect(
     name="link_length",
+    exact=True,
     acts_on="kinematics",
     says="true link = (1 + scale) nominal, all links or each",
     shows="positions in proportion to reach",

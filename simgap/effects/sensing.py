@@ -43,6 +43,7 @@ def _phrase_force_bias(means, rig):
 
 FORCE_BIAS = of_forces(
     BIAS,
+    exact=True,
     says="recorded F = F + b, per finger and axis",
     shows="all subtasks alike, free motion too",
     mistaken_for=("weight", "fingertip_mass"),
@@ -179,6 +180,7 @@ def _spread(name: str) -> Spread:
 
 FORCE_LAG = of_forces(
     LAG,
+    exact=True,
     says="recorded F(t) = F(t - delay)",
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
@@ -203,6 +205,7 @@ FORCE_LAG = of_forces(
 
 FORCE_LOWPASS = of_forces(
     LOWPASS,
+    exact=True,
     says="time_constant dF_rec/dt + F_rec = F",
     shows="rounded contact changes",
     mistaken_for=("force_lag",),

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
-from simgap.attribution.attribute import _examined, _predicting, attribute, noise_of
-from simgap.attribution.heldout import Heldout, scatter_between
+from simgap.attribution.attribute import _examined, _needed, _predicting, attribute, noise_of
+from simgap.attribution.heldout import RESPONSE, Heldout, scatter_between
 from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
-from simgap.attribution.problem import Candidate, Gap, Rows, cosines
+from simgap.attribution.problem import MODELLED, Candidate, Gap, Rows, cosines
 from simgap.attribution.search import Detection, detected, leniently, sought, statistic, weights
 from simgap.attribution.verdict import (
     ALARM,
@@ -450,6 +450,17 @@ def test_probabilities_told_are_as_often_right_as_they_say():
     assert quiet.unseen == pytest.approx(0.2) and Detection(3.0, 0.1, 0.0).unseen == 0.5
     told = conclude([one("", 1.0)], quiet.p_value, unseen=quiet.unseen)
     assert told.verdict == "none" and told.probabilities["none"] == pytest.approx(0.8 / (1 + ALARM))
+
+
+@pytest.mark.parametrize(("form", "needed"), [(MODELLED, False), (RESPONSE, True)])
+def test_a_small_cause_beside_a_large_one_is_needed_where_the_form_of_the_large_one_is_exact(form, needed):
+    gap = gap_of({0: 60.0, 2: 2.5})
+    large, *others = gap.candidates
+    f = forms(replace(gap, candidates=(replace(large, form=form), *others)))
+    both, alone = fitted(f, (0, 2)), fitted(f, (0,))
+    speaks = both.score - fitted(f, ()).score
+    assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks
+    assert _needed(f, both, 2) == needed
 
 
 def test_a_scattering_cause_gains_more_than_the_forms_of_the_others_may_feign():
