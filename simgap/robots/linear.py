@@ -37,15 +37,10 @@ class Moved:
 class Linear:
     """The gap linearised about a point.
 
-    Attributes:
-        point: The point.
-        rows: The rows that are compared.
-        residual: Recorded less simulated values (N,); NaN where a rollout diverged.
-        starts: Derivatives (N,) of the rows by each state of their window's start.
-        moved: How effects move the rows.
-        diverged: Effects whose rollouts diverged.
-        dropped: Number of windows whose rollout diverged.
-        rates: Rates (N,) of the simulated channels.
+    `point`: the point; `rows`: the rows that are compared; `residual`: recorded less simulated values (N,);
+    NaN where a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's
+    start; `moved`: how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number
+    of windows whose rollout diverged; `rates`: rates (N,) of the simulated channels.
     """
 
     point: Point
@@ -180,7 +175,7 @@ def _bounded(values: np.ndarray) -> bool:
     return bool((np.abs(values) < HUGE).all())
 
 
-def wobbling(composed: Composed, linear: Linear) -> Composed:
+def with_wobble(composed: Composed, linear: Linear) -> Composed:
     """The model with the wobble of contacts by all effects that were linearised (see `Composed`)."""
     strikes = linear.rows.regime == REGIMES.index(STRIKES)
     if not (linear.starts and strikes.any() and linear.moved):

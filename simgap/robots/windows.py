@@ -37,11 +37,9 @@ FLIES, RESTS, STRIKES = REGIMES = ("nothing touches", "bodies rest on each other
 class Window:
     """Rows [begin, end) of a log.
 
-    Attributes:
-        log, begin, end: Number of the log and its rows.
-        forward: Whether the start is smoothed from later samples alone.
-        start, doubt: Its states and their standard deviations; None where the simulator does not restart.
-        regime: One of REGIMES, where the simulator reports contacts.
+    `log`, `begin`, `end`: number of the log and its rows; `forward`: whether the start is smoothed from later
+    samples alone; `start`, `doubt`: its states and their standard deviations; None where the simulator does
+    not restart; `regime`: one of REGIMES, where the simulator reports contacts.
     """
 
     log: int
