@@ -1,11 +1,9 @@
-"""What speaks against an identification: replicated data, and remarks for the reader.
+"""Evidence against an identification: posterior-predictive checks, and remarks for the reader.
 
-Posterior-predictive checks: could recordings like these come from the fitted model?
-
-For each channel the discrepancy is the weighted scatter of the grips' means about their prediction,
-with the scatter between grips at its prior median (it may not absorb what is checked): its
-posterior-predictive p-value compares observed with replicated scatter (Gelman, Meng, Stern 1996). A
-small p-value says that grips differ by more than sensors and hand explain.
+For each channel the discrepancy is the weighted scatter of the grips' means about their prediction, with the
+scatter between grips at its prior median (it may not absorb what is checked): its posterior-predictive
+p-value compares observed with replicated scatter (Gelman, Meng, Stern 1996). A small p-value means that grips
+differ by more than sensors and hand explain.
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from estimation.observations import CHANNELS
 from estimation.pads import unit_pads
 from estimation.posterior import NUM_CHANNELS, Posterior
 from estimation.sampler import Draws
-from hmmseg.hand.plausibility import Finding, all_changed
+from hmmseg.hand.plausibility import Finding, changed
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.units import UNITS
@@ -29,7 +27,7 @@ from hmmseg.levels import CERTAIN, MOVED
 from hmmseg.segmentation.align import AlignedTrials
 
 NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.003
-SMALL = (1 - CERTAIN) / len(CHANNELS)  # p-value from which a check warns, so that a result surely has none
+SMALL = (1 - CERTAIN) / len(CHANNELS)  # p-value below which a check warns: rare in a healthy recording
 MEANING = {
     "force": "the net vertical force while carried differs between grips",
     "distance": "the distance of the fingers while held differs between grips",
@@ -39,10 +37,10 @@ MEANING = {
 
 @dataclass(frozen=True)
 class PredictiveCheck:
-    """Posterior-predictive p-value per channel, and warnings for those that are small.
+    """Posterior-predictive p-value per channel, and warnings for small ones.
 
-    `excess`: sd between grips beyond the sensors' noise, posterior median, per channel (N, m, m);
-    `repeats`: observations that determine it, none where the prior alone decides.
+    `excess`: sd between grips beyond the sensors' noise, posterior median, per channel (N, m, m); `repeats`:
+    number of observations that determine it, 0 if only the prior does.
     """
 
     p_values: dict[str, float]
@@ -51,7 +49,7 @@ class PredictiveCheck:
     warnings: tuple[str, ...]
 
     def to_json(self) -> dict:
-        """p-values, excess scatter and what it was learned from, by channel."""
+        """p-values, excess scatter and number of repeats, by channel."""
         return {
             name: {"p_value": p, "scatter_between_grips": self.excess[name], "repeats": self.repeats[name]}
             for name, p in self.p_values.items()
@@ -90,12 +88,12 @@ def check(post: Posterior, draws: Draws, rng: np.random.Generator) -> Predictive
 
 
 STEEL = 7850.0  # physics: [kg/m^3]
-DEEPEST = 10.0  # limit: depths of a block in widths; none is held by two pads that is deeper
-LIGHT = 1500.0  # limit: [kg/m^3]: plastics and stone, of which the unit that makes it is the likeliest
+DEEPEST = 10.0  # limit: depth of a block in widths; two pads hold none that is deeper
+LIGHT = 1500.0  # limit: [kg/m^3]; a usual density, to which the likeliest unit of forces leads
 
 
 def soft_pads(design: Design, rig: Rig) -> list[str]:
-    """Pads that give otherwise than the rig says, as every grip shows while its force changes."""
+    """Pads whose stiffness differs from the rig's, as grips show while their force changes."""
     out, pads = [], unit_pads(rig)
     for prop, (kind, doubt) in zip(("widths", "heights"), design.doubts.items(), strict=True):
         stated = getattr(rig.fingertip, f"{kind}_stiffness")
@@ -111,7 +109,7 @@ def soft_pads(design: Design, rig: Rig) -> list[str]:
 
 
 def unstated_pads(design: Design) -> list[str]:
-    """Pads whose stiffness the rig leaves open: what is certain of them is what the recordings show."""
+    """Pads whose stiffness the rig leaves open."""
     props = {u.prop for u in design.unknowns}
     return [
         f"the rig states no [fingertip] {kind}_stiffness: {prop}s allow for pads that give as much as the "
@@ -122,7 +120,7 @@ def unstated_pads(design: Design) -> list[str]:
 
 
 def unnamed(task: BlockTask, design: Design) -> list[str]:
-    """Moves that should be level and are not: something that the task does not name lies beneath."""
+    """Moves that should be level and are not: an unnamed object lies beneath."""
     return [
         f"{task.performed[move].object} was {'raised' if rise > 0 else 'lowered'} by {abs(rise) * 1e3:.1f} "
         "mm, though the task moves it on a level: an object that the task does not name may lie beneath"
@@ -132,14 +130,13 @@ def unnamed(task: BlockTask, design: Design) -> list[str]:
 
 
 def misfits(aligned: AlignedTrials) -> list[str]:
-    """What does not fit the task, trial by trial, and what was remarked on while aligning."""
-    found = [trial.segmentation for trial in aligned.trials]
-    remarks = dict.fromkeys(remark for s in found for remark in s.remarks)
-    return [*(f"{s.file}: {failure}" for s in found for failure in s.failures), *remarks]
+    """What does not fit the task, trial by trial, and the remarks of the alignment."""
+    remarks = dict.fromkeys(remark for s in aligned.segmentations for remark in s.remarks)
+    return [*(f"{s.file}: {failure}" for s in aligned.segmentations for failure in s.failures), *remarks]
 
 
 def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> list[str]:
-    """Blocks too heavy for their size, of whatever they are made: forces in a smaller unit than N.
+    """Blocks too heavy for their size in any material: forces in a smaller unit than N.
 
     `found`: means by (object, property) [N, m].
     """
@@ -153,7 +150,7 @@ def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> 
         density = weight / (rig.gravity * area**1.5)
         unit = min(("mN", "gf"), key=lambda name: abs(np.log(density * UNITS[name][1] / LIGHT)))
         names = rig.gripper.wrench[:3] if rig.gripper is not None else FORCE_CHANNELS
-        remedy = Finding(names[0], "", all_changed(names, rig, unit=unit)).remedy
+        remedy = Finding(names[0], "", changed(names, rig, unit=unit)).remedy
         return [
             f"{obj} weighs {weight:.3g} N at {width * 1e3:.3g} x {area / width * 1e3:.3g} mm: of steel it "
             f"would be {depth:.2g} m deep, so forces look like {unit}; expected {remedy}"
@@ -162,16 +159,17 @@ def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> 
 
 
 def unrepeated(design: Design) -> list[str]:
-    """Where no grip repeats another, the prior alone says how far off the contact equations may be."""
+    """Channels without repeated grips, whose model error rests on the prior alone."""
     seen = np.bincount(design.channel, minlength=len(CHANNELS)) > 0
     alone = [name for name, n, s in zip(CHANNELS, design.repeats(), seen, strict=True) if s and n == 0]
-    text = (f"no grip repeats another, so how far the model itself may be off in {', '.join(alone)} is taken "
-            "from its prior; a second trial would show it")  # fmt: skip
-    return [text] * bool(alone)
+    if not alone:
+        return []
+    return [f"no grip repeats another, so how far the model itself may be off in {', '.join(alone)} is taken "
+            "from its prior; a second trial would show it"]  # fmt: skip
 
 
 def unchecked(design: Design, rig: Rig) -> list[str]:
-    """What nothing in a recording contradicts if the rig has it wrong."""
+    """Errors of the rig that no recording would contradict."""
     if not rig.jointed or not any(u.prop == "width" for u in design.unknowns):
         return []
     return [

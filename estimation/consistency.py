@@ -1,30 +1,30 @@
-"""Whether the scales of a recording agree: forces with pads, the two fingers and positions with each other.
+"""Consistency of a recording's scales: forces with pads, the two fingers and positions with each other.
 
-Mechanics ties channels to each other whatever the blocks are. Each tie estimates how far a scale of the hand
-is off (0 where rig.toml is right), with the error of that estimate:
+Mechanics ties channels to each other whatever the blocks are. Each tie estimates the error of a scale of the
+hand (0 if rig.toml is right), with an uncertainty:
 
-- *squeeze*: two fingers press what they carry alike: where finger 1 is read g times too large, fx1 = -g fx2.
-- *balance*: what they carry weighs W (1 + a / g) however they share it: where finger 1 is read g times too
-  large, their sum follows their difference, d(fy1 + fy2) / d(fy1 - fy2) = (g - 1) / (g + 1).
-- *rigidity*: a held block keeps its width on its way, so that the fingers' distance, the pads' squeeze taken
-  out, has no slope over the hand's place. Angles, links or bases that are off give it one.
-- *motion*: positions go as far as their velocities carry them.
-- *room*: no fingertip is where a block stands.
-- *level*: a fingertip that holds a block is neither beneath what that stands on nor above its top.
+- *squeeze*: both fingers press a carried block equally: if finger 1 is read g times too large, fx1 = -g fx2.
+- *balance*: a carried block weighs W (1 + a / g) however the fingers share it: if finger 1 is read g times
+  too large, their sum follows their difference, d(fy1 + fy2) / d(fy1 - fy2) = (g - 1) / (g + 1).
+- *rigidity*: a held block keeps its width, so the fingers' distance, corrected for the pads' squeeze, has no
+  slope over the position of the hand. Wrong angles, links or bases give it one.
+- *motion*: displacements equal integrated velocities.
+- *room*: no fingertip enters the space of a standing block.
+- *level*: a fingertip that holds a block is neither below its bottom nor above its top.
 
-Of each, two hypotheses are compared: the hand is as well made as its rig says, or something is misstated, by
-a size of which little is known. Normal densities about 0 of sd (error, WELL_MADE) and (error, WELL_MADE,
-SIZE) give the odds; a scale is contradicted, and what hangs on it is no number, where it is misstated with a
-probability of CERTAIN. With the prior odds of WRONG that takes some 4.5 sds of a healthy hand.
+For each tie two hypotheses are compared: the hand is as accurate as its rig says, or a scale is misstated by
+a size of which little is known. Normal densities about 0 with sds (error, WELL_MADE) and (error, WELL_MADE,
+SIZE) give the odds; a scale is contradicted, and dependent properties get no number, if it is misstated with
+a probability of CERTAIN. With prior odds of WRONG this takes about 4.5 sds of a healthy hand.
 
-Forces on another scale alike are a matter of pads and noise. A force that is read g times too large squeezes
-pads that seem 1 / g times as soft, and its noise is g times the stated one; pads that truly differ leave the
-noise alone. Where [fingertip] states the pads, four explanations of what grips show are weighed against each
-other: the rig is right, its pads are wrong, both axes of force are scaled by g, or the vertical alone. A
-weight is then drawn from all of them, so that its interval holds the truth whichever it is.
+A common scale of all forces is a matter of pads and noise. Forces read g times too large squeeze pads that
+seem 1 / g times as soft, with g times the stated noise; pads that truly differ leave the noise unchanged. If
+[fingertip] states the pads, four explanations of the grips are compared: the rig is right, its pads are
+wrong, both force axes are scaled by g, or the vertical axis alone. Weights are then drawn from all of them,
+so that their intervals cover the truth whichever holds.
 
-Nothing checks what all of these leave alone: the distance of the fingers' bases as long as there is room,
-and the length of all links together.
+Nothing checks what all of these leave invariant: the distance of the fingers' bases as long as there is room,
+and the common length of all links.
 """
 
 from __future__ import annotations
@@ -50,19 +50,19 @@ from hmmseg.segmentation.align import AlignedTrials
 
 WRONG = 0.01  # prior: share of recordings in which one such scale is misstated
 # learned: above the sds of 45 healthy hands by consistency.py of commit f82105c, whose slopes were 3e-4: of
-# logarithms of gains and rates, of slopes [m/m], of places [m]; [systematic] of rig.toml comes on top
+# logarithms of gains and rates, of slopes [m/m], of places [m]; in addition to [systematic] of rig.toml
 WELL_MADE = {
     "squeeze": 0.015, "balance": 0.03, "rigidity": 1e-3, "motion": 0.04, "room": 5e-4, "level": 1.5e-3,
 }  # fmt: skip
 # prior: sds of what is misstated, in the same units
 SIZE = {"squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "level": 0.02}
-BRIEF = 5  # numerics: samples that are no glitch
-FEWEST = 8  # numerics: samples of a carry that determine a slope
+BRIEF = 5  # numerics: fewer samples may be a glitch
+FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
 
 @dataclass(frozen=True)
 class Grip:
-    """Where the fingertips hold a block that stands [m], before (`pickup`) or after (`place`) a move."""
+    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move."""
 
     move: int
     key: str
@@ -75,10 +75,10 @@ class Grip:
 
 @dataclass(frozen=True)
 class Tie:
-    """One tie: by how much it does not hold, and what is worth nothing if it does not.
+    """One tie: its violation, and the properties that depend on it.
 
-    `value` +- `error`: how far the scale is off; `made`: sd of healthy hands that the rig itself admits, on
-    top of WELL_MADE; `properties` hang on it; `text` says what is seen.
+    `value` +- `error`: error of the scale; `made`: sd of healthy hands that the rig itself admits, in
+    addition to WELL_MADE; `properties` depend on it; `text` describes the violation.
     """
 
     kind: str
@@ -90,7 +90,7 @@ class Tie:
 
     @property
     def probability(self) -> float:
-        """That something is misstated."""
+        """Probability that a scale is misstated."""
         healthy = float(np.hypot(self.error, np.hypot(WELL_MADE[self.kind], self.made)))
         wrong = float(np.hypot(healthy, SIZE[self.kind]))
         gain = np.log(healthy / wrong) + 0.5 * self.value**2 * (1 / healthy**2 - 1 / wrong**2)
@@ -98,7 +98,7 @@ class Tie:
 
 
 def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> dict[str, str]:
-    """Why properties are worth nothing, by `object.property`: scales that contradict each other."""
+    """Why properties get no number, by `object.property`: contradictory scales."""
     out: dict[str, str] = {}
     for tie in ties(aligned, weighed, design):
         if tie.probability > CERTAIN:
@@ -110,20 +110,21 @@ def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], desi
 
 def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
     """All ties that a recording determines."""
-    if not any(one.trial.inertia is not None for one in aligned.trials):  # a wrist's fingers are made up
-        yield from _sideways(aligned.rig, weighed)
-        if not aligned.late:
-            yield from _carried(aligned, weighed)
-        yield from _rigid(aligned, weighed)
-        yield from _moving(aligned)
-        yield from _room(aligned, weighed)
-        yield from _levels(aligned, weighed, design)
+    if any(one.trial.inertia is not None for one in aligned.trials):  # the fingers of a wrist are virtual
+        return
+    yield from _squeeze(aligned.rig, weighed)
+    if not aligned.late:
+        yield from _balance(aligned, weighed)
+        yield from _rigidity(aligned, weighed)
+    yield from _motion(aligned)
+    yield from _room(aligned, weighed)
+    yield from _level(aligned, weighed, design)
 
 
 def _carries(
     weighed: Sequence[WeighedTrial], name: str, *needed: str
 ) -> Iterator[tuple[WeighedTrial, int, np.ndarray]]:
-    """Trial, move and weights (num_timesteps,) of each grip's mean `name` where all `needed` are there."""
+    """Trial, move and weights (num_timesteps,) of each grip's mean `name` where all `needed` are recorded."""
     for a in weighed:
         known = np.all([np.isfinite(getattr(a.signals, each)) for each in needed], axis=0)
         for move, grip in a.weights.grips.items():
@@ -132,8 +133,8 @@ def _carries(
                 yield a, move, weight / weight.sum()
 
 
-def _sideways(rig: Rig, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
-    """Two fingers press what they carry alike, but for its inertia."""
+def _squeeze(rig: Rig, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """Both fingers press a carried block equally, apart from its inertia."""
     pressed = []
     for a, _, weight in _carries(weighed, "force", "fx1", "fx2"):
         free = free_forces(a.signals, a) if a.weights.free.any() else np.zeros(4)
@@ -152,8 +153,8 @@ def _sideways(rig: Rig, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
                   ("weight", "width", "friction"), text, made)  # fmt: skip
 
 
-def _carried(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
-    """Two fingers carry the same weight however they share it."""
+def _balance(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """Both fingers carry the same weight however they share it."""
     rig, performed = aligned.rig, aligned.task.performed
     of, sums, apart, factors, weights, noises = [], [], [], [], [], []
     for a, move, weight in _carries(weighed, "force", "fy1", "fy2"):
@@ -194,9 +195,9 @@ def _carried(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterato
         yield Tie("balance", ratio, 2 * error / (1 - slope**2), ("weight", "height", "friction"), text, made)
 
 
-def _rigid(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+def _rigidity(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
     """A held block keeps its width wherever the hand takes it."""
-    rig, found = aligned.rig, []
+    rig, fits = aligned.rig, []
     for a, _, weight in _carries(weighed, "distance", "x", "y", "distance", "fx1", "fx2"):
         s, root = a.signals, np.sqrt(weight)
         width = np.nan_to_num(channel_values(s, rig)["distance"])
@@ -205,15 +206,15 @@ def _rigid(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[
         slope = np.linalg.lstsq(rows, width * root, rcond=None)[0]
         rest = width * root - rows @ slope
         covariance = np.linalg.pinv(rows.T @ rows) * (rest @ rest) / max((weight > 0).sum() - 3, 1)
-        found.append(np.stack([slope[1:], np.diag(covariance)[1:]]))
-    if not found or aligned.late:
+        fits.append(np.stack([slope[1:], np.diag(covariance)[1:]]))
+    if not fits:
         return
-    slopes, variances = np.moveaxis(np.array(found), 1, 0)
+    slopes, variances = np.moveaxis(np.array(fits), 1, 0)
     admitted = [*rig.systematic.joint_offset, *rig.systematic.link_length] if rig.jointed else [0.0]
-    made = float(np.linalg.norm(admitted))  # sd of the slope that the rig's own [systematic] makes
+    made = float(np.linalg.norm(admitted))  # sd of the slope due to the rig's own [systematic]
     for k, axis in enumerate(("horizontally", "vertically")):
         steep = float(np.median(slopes[:, k]))
-        spread = float(np.median(np.abs(slopes[:, k] - steep))) * 1.4826
+        spread = robust_sd(slopes[:, k] - steep)
         error = max(spread, float(np.sqrt(np.median(variances[:, k])))) / np.sqrt(len(slopes))
         text = (
             f"the fingers' distance changes by {1e2 * abs(steep):.2g} cm a metre that the hand carries a "
@@ -223,26 +224,26 @@ def _rigid(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[
         yield Tie("rigidity", steep, error, ("width", "height"), text, made)
 
 
-def _moving(aligned: AlignedTrials) -> Iterator[Tie]:
-    """Positions go as far as their velocities carry them."""
+def _motion(aligned: AlignedTrials) -> Iterator[Tie]:
+    """Displacements equal integrated velocities."""
     slopes = [
         [scale_to_velocity(one.trial, *pair) for pair in position_pairs(one.trial)] for one in aligned.trials
     ]
-    known = np.array(slopes).ravel()
-    known = known[np.isfinite(known) & (known > 0)]
-    if known.size < 2 or known.size <= len(slopes) * len(slopes[0]) / 2:
+    ratios = np.array(slopes).ravel()
+    usable = ratios[np.isfinite(ratios) & (ratios > 0)]
+    if usable.size < 2 or usable.size <= ratios.size / 2:
         return
-    logs = np.log(known)
+    logs = np.log(usable)
     text = (
         f"positions go {1 / np.exp(np.median(logs)):.3g} times as far as their velocities carry them: one of "
         "the two scales is wrong"
     )
-    error = float(robust_sd(logs - np.median(logs)) / np.sqrt(known.size))
+    error = float(robust_sd(logs - np.median(logs)) / np.sqrt(usable.size))
     yield Tie("motion", float(np.median(logs)), error, ("width", "height"), text)
 
 
 def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iterator[Grip]:
-    """Where the fingertips hold each block that stands, and what it stands on."""
+    """Where the fingertips hold each standing block."""
     for move, grip in a.weights.grips.items():
         ground = [s for s in aligned.subtasks if s.move == move and s.state == ON_GROUND and present[s.index]]
         for key, of in (("pickup", ground[:1]), ("place", ground[1:])):
@@ -254,7 +255,7 @@ def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iter
 
 
 def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
-    """No fingertip is where a block stands: by how far one is in the median trial."""
+    """No fingertip enters the space of a standing block: by how far one does in the median trial."""
     task, every = aligned.task, []
     for a, one in zip(weighed, aligned.trials, strict=True):
         s, deepest, support = a.signals, 0.0, dict(task.initial)
@@ -264,7 +265,7 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
         for grip in grips:
             start, end = spans[grip.subtask]
             of_it = [g.subtask for g in grips if g.object == grip.object]
-            if grip.key == "pickup":  # it has stood there since it was put down, or from the beginning
+            if grip.key == "pickup":  # it has stood there since it was last put down, or from the start
                 before = [k for k in of_it if k < grip.subtask]
                 since, until = spans[max(before)][1] if before else s.t[0], start
             else:
@@ -288,10 +289,10 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
     yield Tie("room", depth, 0.0, ("width",), text)
 
 
-def _levels(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
-    """Blocks are held between bottom and top; of a hand with joints, whose heights hang on its links."""
+def _level(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
+    """Blocks are held between bottom and top; for hands with joints, whose heights depend on their links."""
     if not aligned.rig.jointed:
-        return  # whose y = 0 need not be the ground
+        return  # y = 0 need not be the ground
     heights = _heights(design)
     off: dict[tuple[int, str], list[float]] = {}
     for a, one in zip(weighed, aligned.trials, strict=True):
@@ -317,27 +318,27 @@ def _levels(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Des
 
 
 def _heights(design: Design) -> dict[str, float]:
-    """Heights [m] of the objects whose height alone is determined, by least squares."""
+    """Heights [m] of the objects whose height is determined on its own, by least squares."""
     rows = (design.channel == RISE) & ~design.slope
     mine = [i for i, u in enumerate(design.unknowns) if u.prop == "height"]
     if not rows.any() or not mine:
         return {}
-    found = np.linalg.lstsq(design.coefficients[rows][:, mine], design.mean[rows], rcond=None)[0]
+    heights = np.linalg.lstsq(design.coefficients[rows][:, mine], design.mean[rows], rcond=None)[0]
     unknowns = [design.unknowns[i] for i in mine]
-    return {u.name[0]: float(v) for u, v in zip(unknowns, found, strict=True) if u.single}
+    return {u.name[0]: float(v) for u, v in zip(unknowns, heights, strict=True) if u.single}
 
 
-MISREAD = 0.5  # prior: share of forces among what is to blame where pads and forces contradict each other
+MISREAD = 0.5  # prior: probability that forces are to blame if pads and forces contradict each other
 GAIN_LOG_SD = 1.0  # prior: of log g: another range or unit of the amplifier
 PADS_LOG_SD = 0.8  # prior: of a wrong stiffness: foams of another kind are a third or three times as stiff
-NOISE_LOG_SD, AXIS_LOG_SD = 0.35, 0.3  # prior: noise is off its statement by a factor of two once in twenty
-GRID = np.linspace(np.log(1e-3), np.log(1e3), 2001)  # numerics: log g; twice a third of a percent a step
-TELLING = 1.0  # limit: sd of the pads' share along the grip, from which grips show nothing of it
+NOISE_LOG_SD, AXIS_LOG_SD = 0.35, 0.3  # prior: stated noise is off by a factor of two once in twenty
+GRID = np.linspace(np.log(1e-3), np.log(1e3), 2001)  # numerics: log g, in steps of 0.7 %
+TELLING = 1.0  # limit: sd of the pads' share along the grip beyond which grips are uninformative
 
 
 @dataclass(frozen=True)
 class ForceScale:
-    """The posterior of g (GRID,), by which vertical forces are read too large, and that of any g but 1.
+    """Posterior of the factor g by which vertical forces are read too large.
 
     `probability` that forces are misread; `density` (len(GRID),) of log g if they are.
     """
@@ -346,14 +347,14 @@ class ForceScale:
     density: np.ndarray
 
     def corrected(self, chain: np.ndarray, weights: list[int], rng: np.random.Generator) -> np.ndarray:
-        """Draws (walkers, steps, Q), those of `weights` [N] with g drawn from its posterior."""
+        """Draws (walkers, steps, Q) with those of `weights` [N] divided by draws of g."""
         out, size = chain.copy(), chain.shape[:2]
         misread = rng.uniform(size=size) < self.probability
         out[..., weights] *= np.exp(-(misread * rng.choice(GRID, size, p=self.density)))[..., None]
         return out
 
     def remark(self) -> str:
-        """What contradicts what, for people."""
+        """The contradiction, for people."""
         g = float(np.exp(self.density @ GRID))
         size = f"{g:.2g} times too large" if g > 1 else f"{1 / g:.2g} times too small"
         return (
@@ -366,9 +367,9 @@ class ForceScale:
 def force_scale(
     doubts: Mapping[str, PadDoubt], weighed: Sequence[WeighedTrial], rig: Rig
 ) -> ForceScale | None:
-    """The scale of forces where pads and noise say anything against 1; None where nothing does.
+    """Scale of the forces if pads and noise give any evidence against 1, else None.
 
-    Not to be used where forces come late, which makes slopes of readings over them flat.
+    Not applicable to late forces, which flatten the slopes of readings over them.
     """
     tip = rig.fingertip
     if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
@@ -376,10 +377,10 @@ def force_scale(
     (normal, normal_sd), (shear, shear_sd) = (doubt.seen for doubt in doubts.values())
     if normal_sd > TELLING:
         return None
-    share = np.expm1(-GRID)  # of compliance beyond the stated one, where forces are g times too large
+    share = np.expm1(-GRID)  # apparent excess compliance if forces are g times too large
 
     def pads(of_normal: np.ndarray | float, of_shear: np.ndarray | float) -> np.ndarray:
-        """Log likelihood (len(GRID),) of both shares where truly these."""
+        """Log likelihood (len(GRID),) of both shares given their true values."""
         out = np.zeros(GRID.size)
         for seen, sd, true in ((normal, normal_sd, of_normal), (shear, shear_sd, of_shear)):
             if np.isfinite(sd):
@@ -390,7 +391,7 @@ def force_scale(
     excess = _noise_excess(weighed, rig)
 
     def noise(of_x: np.ndarray | float, of_y: np.ndarray | float) -> np.ndarray:
-        """Log likelihood of the noise of both axes, read `of` (logarithms) times too large."""
+        """Log likelihood of the noise of both axes, read too large by these log factors."""
         if excess is None:
             return np.zeros(GRID.size)
         covariance = np.full((2, 2), NOISE_LOG_SD**2) + AXIS_LOG_SD**2 * np.eye(2)
@@ -416,7 +417,7 @@ def force_scale(
     ])  # fmt: skip
     odds = np.exp(log_odds - np.logaddexp.reduce(log_odds))
     wrong = float(odds[2] + odds[3])
-    if wrong < MISSTATED:  # no likelier than that anything at all is wrong, before grips are seen
+    if wrong < MISSTATED:  # below the prior probability that anything is wrong
         return None
     prior = normal_prior(GAIN_LOG_SD)
     of_g = [np.exp(prior + each - np.logaddexp.reduce(prior + each)) for each in (both, vertical)]
@@ -425,7 +426,7 @@ def force_scale(
 
 
 def _noise_excess(weighed: Sequence[WeighedTrial], rig: Rig) -> tuple[float, float] | None:
-    """Logarithm of the noise of fx and of fy over the stated one; None where it is filtered or unstated."""
+    """Log ratio of the noise of fx and of fy to the stated one; None if filtered or unstated."""
     if rig.noise.force is None:
         return None
     out = []
@@ -440,7 +441,7 @@ def _noise_excess(weighed: Sequence[WeighedTrial], rig: Rig) -> tuple[float, flo
         if neighbours.size < MIN_FREE or not every.any() or neighbours.mean() / np.mean(every**2) > WHITE:
             return None
         shown = robust_sd(every) / np.sqrt(6)
-        if shown == 0:  # coarser than its noise
+        if shown == 0:  # resolution coarser than the noise
             return None
         out.append(float(np.log(shown)))
     return out[0], out[1]

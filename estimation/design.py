@@ -1,17 +1,16 @@
 """The linear-Gaussian core of the properties' likelihood, assembled from aligned trials.
 
-Every grip of every trial gives up to three observations (`estimation.observations`), each in its
-channel c:
+Every grip of every trial gives up to three observations (`estimation.observations`), each in its channel c:
 
-    mean = A . unknowns + J . deviations + unit (common_c + own) + noise,
+    mean = A . unknowns + J . deviations + unit (common_c + own) + noise.
 
-A holds gravity factors (force), ones (distance) and coefficients of heights (rise), J finite
-differences through the hand: each deviation of the rig's [systematic] table reads a trial again by a hand
-that deviates by a small step, with the same sample weights. `unit` is the quantity that the channel's
-equation is built on: the carried force, the pads' give along the grip, what their shear deflection differs
-by between pickup and place. What the equation leaves out is stated as a share of it: one that all grips have
-in common, one that differs from grip to grip. Slopes over the pads' give within a grip (`estimation.pads`)
-show these shares themselves (unit 1), whatever the block.
+A contains gravity factors (force), ones (distance) and coefficients of heights (rise); J finite differences
+through the hand: for each deviation in the rig's [systematic] table the trial is re-read by a hand that
+deviates by a small step, with the same sample weights. `unit` is the quantity on which the channel's equation
+rests: the carried force, the pads' give along the grip, the difference of their shear deflection between
+pickup and place. Model error is a share of it: one share common to all grips, and one that differs between
+grips. Slopes over the pads' give within a grip (`estimation.pads`) show these shares directly (unit 1),
+whatever the block.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ def _echelon(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[di
 
 
 def _whole(row: Mapping[str, Fraction], order: Sequence[str]) -> Terms:
-    """The same direction with coprime whole coefficients, the first positive."""
+    """The same direction with coprime integer coefficients, the first positive."""
     terms = {name: row[name] for name in order if name in row}
     common = lcm(*(v.denominator for v in terms.values()))
     whole = {k: int(v * common) for k, v in terms.items()}
@@ -97,7 +96,7 @@ FORCE, DISTANCE, RISE = range(len(CHANNELS))
 
 @dataclass(frozen=True)
 class Unknown:
-    """What the recording determines: a property, or a combination of one property of several objects."""
+    """A quantity that the recording determines: a property, or a combination of one property over objects."""
 
     prop: str
     terms: Terms
@@ -109,12 +108,12 @@ class Unknown:
 
     @property
     def properties(self) -> tuple[str, ...]:
-        """`object.property` of all that enter."""
+        """`object.property` of all terms."""
         return tuple(f"{obj}.{self.prop}" for obj in self.terms)
 
     @property
     def name(self) -> tuple[str, str]:
-        """(object, property); objects of a combination joined as in `b + c`."""
+        """(object, property); the objects of a combination joined as in `b + c`."""
         text = ""
         for obj, c in self.terms.items():
             sign = " - " if c < 0 else " + "
@@ -125,7 +124,7 @@ class Unknown:
 def determined(
     task: BlockTask, objects: Sequence[str], rises: dict[int, Terms], there: np.ndarray
 ) -> tuple[Unknown, ...]:
-    """What the moves recorded in `there` (num_moves, 3) determine, objects in the task's order."""
+    """Unknowns determined by the moves recorded in `there` (num_moves, 3), objects in the task's order."""
     weighed, spanned = (set(np.array(objects)[there[:, c]]) for c in (FORCE, DISTANCE))
     heights = simplest_combinations([rises[int(m)] for m in np.flatnonzero(there[:, RISE])], task.objects)
     out = []
@@ -155,18 +154,18 @@ def coefficients_of(
     return out
 
 
-# prior: a pad whose stiffness is in doubt need not be linear: at half the force its compliance may be off
-# by as much again. Elastic contact (Hertz) has an exponent of 2/3; most pads lie between that and 1.
+# prior: largest sd of a pad's exponent about 1. A pad of doubtful stiffness need not be linear: at half the
+# force its compliance may be off by as much again. Elastic contact (Hertz) has 2/3, most pads 2/3 to 1.
 MOST_BENT = 0.5
-UNLIKE = 0.3  # prior: by which share of what both pads have alike one may differ: foams of one make do
+UNLIKE = 0.3  # prior: difference between both pads, as a share of their common deviation: foams of one make
 
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One deviation: its name, prior standard deviation, and how a trial is read under it.
+    """One deviation of the hand: its name, prior standard deviation, and effect.
 
-    `read(trial, rig, size)` gives the task-space signals as a hand that truly deviates by `size`
-    from the nominal rig means them; `step` is a small deviation for finite differences.
+    `read(trial, rig, size)` gives the task-space signals of a trial by a hand that deviates by `size` from
+    the nominal rig; `step` is a small deviation for finite differences.
     """
 
     name: str
@@ -196,13 +195,12 @@ def _longer_link(finger: int, link: int):
 
 @dataclass(frozen=True)
 class PadDoubt:
-    """What recordings show of both pads along the grip, or in shear, and the rig does not admit.
+    """Disagreement of recordings with the rig about both pads, along the grip or in shear.
 
-    Their compliance seems 1 + `share` times the nominal; `odds` is the probability that the rig is so wrong.
-    `apart`: what slopes are off by alike. `give`: how much pads may give, by what the recordings show, whose
-    stiffness the rig leaves unstated; 0 where it states one. `usual`: force of one finger as it usually is in
-    a grip, or where a block is put down [N]. `seen`: that share and its sd whatever the odds, infinite where
-    unknown.
+    Their compliance seems 1 + `share` times the nominal; `odds` is the probability that the rig is wrong by
+    that. `apart`: error common to all slopes. `give`: possible give of pads whose stiffness the rig leaves
+    unstated, according to the recordings; 0 if it states one. `usual`: typical force of one finger in a grip,
+    or where a block is put down [N]. `seen`: the share and its sd whatever the odds, infinite if unknown.
     """
 
     share: float = 0.0
@@ -216,53 +214,39 @@ class PadDoubt:
     def extra_sd(self) -> float:
         """Prior standard deviation of the share beyond what the rig admits.
 
-        That of 0 where the rig is right, and of as much as the slopes show where it is not.
+        A mixture of 0 if the rig is right, and of the share that the slopes show if it is wrong.
         """
         return abs(self.share) * float(np.sqrt(self.odds))
 
     @property
     def slope_sd(self) -> float:
-        """What slopes are off by alike and each of its own.
+        """Common error of the slopes, and of each slope on its own.
 
-        A share of what truly gives, and what noise of forces or places may make of all of them.
+        A share of the true give, and the common effect of noise in forces or places.
         """
         return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 
-def _softer_pads(fingers: tuple[int, ...], axis: str):
+def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads whose compliance is 1 + size of the nominal: their faces lie elsewhere under a force."""
+        """Pads whose compliance is 1 + size of the nominal, so that their faces lie elsewhere under a force.
+
+        With `usual`: pads that give as force^(1 + size), as the nominal at that force; to first order.
+        """
         signals, moved = task_space(trial, rig), {}
         for finger in fingers:
-            name = f"{axis}{finger}"
-            give = getattr(signals, f"f{name}") * _compliance(rig, finger, axis)
-            moved[name] = getattr(signals, name) - give * size
+            name = f"{'x' if kind == 'normal' else 'y'}{finger}"
+            law = getattr(signals, f"f{name}")
+            if usual is not None:
+                law = law * np.log(np.maximum(np.abs(law), 1e-3 * usual) / usual)
+            moved[name] = getattr(signals, name) - law * getattr(unit_pads(rig), f"{kind}{finger}") * size
         return replace(signals, **moved)
 
     return read
-
-
-def _bent_pads(axis: str, usual: float):
-    def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads that give as force^(1 + size), as the nominal at the force `usual`; to first order."""
-        signals, moved = task_space(trial, rig), {}
-        for finger in (1, 2):
-            name = f"{axis}{finger}"
-            force = getattr(signals, f"f{name}")
-            bend = force * np.log(np.maximum(np.abs(force), 1e-3 * usual) / usual)
-            moved[name] = getattr(signals, name) - _compliance(rig, finger, axis) * bend * size
-        return replace(signals, **moved)
-
-    return read
-
-
-def _compliance(rig: Rig, finger: int, axis: str) -> float:
-    """Of one pad [m/N]: along the grip (x) or in shear (y)."""
-    return getattr(unit_pads(rig), ("normal" if axis == "x" else "shear") + str(finger))
 
 
 def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
-    """Fingers that touch a block when they are `size` further apart than their distance says."""
+    """Fingers that touch a block when they are `size` farther apart than their distance says."""
     signals = task_space(trial, rig)
     return replace(signals, x1=signals.x1 - size / 2, x2=signals.x2 + size / 2)
 
@@ -270,10 +254,10 @@ def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
 def nuisances(
     rig: Rig, biased: np.ndarray, doubts: Mapping[str, PadDoubt], touch_sd: float = 0.0
 ) -> tuple[Nuisance, ...]:
-    """The deviations that the rig admits, and those that recordings show as well.
+    """Deviations that the rig admits, and those that recordings reveal.
 
-    `biased` (4,): extra prior sd of each force bias [N]; `doubts`: of the pads, "normal" and "shear";
-    `touch_sd` [m]: how well the distance is known at which the fingers touch a block.
+    `biased` (4,): extra prior sd of each force bias [N]; `doubts`: about the pads, "normal" and "shear";
+    `touch_sd` [m]: uncertainty of the distance at which the fingers touch a block.
     """
     s, out = rig.systematic, list[Nuisance]()
 
@@ -289,30 +273,29 @@ def nuisances(
             admit(f"joint_offset.{name}", sd, 1e-5, _with_channel(name, lambda q, d: q - d))
         for (finger, link), sd in zip(product((1, 2), (0, 1)), s.link_length, strict=True):
             admit(f"link_length.{finger}{link + 1}", sd, 1e-5, _longer_link(finger, link))
-    # What slopes show is compliance and exponent together, so either may be off by as much as both; the bend
-    # is that of what gives.
+    # Slopes show compliance and exponent together, so either may be off by as much as both.
     stated = min(max(doubts["normal"].extra_sd, *s.pad_stiffness) / np.log(2), MOST_BENT)
-    # Pads of one hand are of one make: of what their stiffness is stated to be in doubt by, most is common.
+    # The pads of one hand are of one make, so most of the stated uncertainty of their stiffness is common.
     common = min(s.pad_stiffness) * np.sqrt(1 - UNLIKE**2)
-    for axis, (kind, doubt) in zip("xy", doubts.items(), strict=True):
+    for kind, doubt in doubts.items():
         bend = MOST_BENT * doubt.give or (stated if kind == "normal" else 0.0)
         admitted = 0.0 if doubt.give else common
         both = max(doubt.extra_sd, UNSTATED if doubt.give else 0.0)
         both = float(np.hypot(np.hypot(both, bend) if both else 0.0, admitted))
-        admit(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis))
+        admit(f"pad_{kind}", both, 1e-3, _other_pads(kind, (1, 2)))
         for finger in (1, 2):
             own = 0.0 if doubt.give else s.pad_stiffness[finger - 1]
             sd = np.sqrt(own**2 - admitted**2 + (UNLIKE * max(doubt.extra_sd, doubt.give)) ** 2)
-            admit(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis))
+            admit(f"pad_{kind}.{finger}", sd, 1e-3, _other_pads(kind, (finger,)))
         if any(n.name.startswith(f"pad_{kind}") for n in out):
-            admit(f"pad_{kind}_exponent", bend, 1e-3, _bent_pads(axis, max(doubt.usual, 1e-3)))
+            admit(f"pad_{kind}_exponent", bend, 1e-3, _other_pads(kind, (1, 2), max(doubt.usual, 1e-3)))
     admit("touch", touch_sd, 1e-5, _wider)
     return tuple(out)
 
 
-ZERO_SHARE = 0.05  # limit: of the largest force: a zero that moves by less matters less than other errors
+ZERO_SHARE = 0.05  # limit: share of the largest force; a zero that drifts less matters less than other errors
 
-# Slopes that show the pads, by their names in `Weights.slopes`: the channel they are of, whose samples.
+# Slopes that show the pads, by their names in `Weights.slopes`: their channel, and the readings they weigh.
 SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
 
 
@@ -328,27 +311,27 @@ def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[i
 
 
 def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
-    """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where none."""
+    """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where absent."""
     values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
         for k, (name, (_, reading)) in enumerate(SLOPES.items()):
-            found = weighed.weights.slopes.get(move, {}).get(name)
-            if found is not None:
-                out[i, k] = found.weights @ np.nan_to_num(values[reading])
+            slope = weighed.weights.slopes.get(move, {}).get(name)
+            if slope is not None:
+                out[i, k] = slope.weights @ np.nan_to_num(values[reading])
     return out
 
 
 def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Variances (num_moves, len(SLOPES)) of slopes, infinite of none, and what they may be off by alike."""
-    found = [[weighed.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
-    variance = [[np.inf if s is None else s.variance for s in row] for row in found]
-    return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in found])
+    """Variances (num_moves, len(SLOPES)) of slopes, infinite where absent, and their common errors."""
+    slopes = [[weighed.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
+    variance = [[np.inf if s is None else s.variance for s in row] for row in slopes]
+    return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in slopes])
 
 
 def pad_doubts(
     slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
 ) -> dict[str, PadDoubt]:
-    """What slopes (num_trials, num_moves, len(SLOPES)) say against the rig's pads, "normal" and "shear".
+    """Evidence of slopes (num_trials, num_moves, len(SLOPES)) against the rig's pads, "normal" and "shear".
 
     `variance`, `alike`: as in `slope_variances`, of all trials.
     """
@@ -362,20 +345,20 @@ def pad_doubts(
         (("normal", DISTANCE, -1.0), ("shear", RISE, 1.0)), np.median(usual, axis=0).tolist(), strict=True
     ):
         stated = bool(np.isfinite(getattr(rig.fingertip, f"{kind}_stiffness")))
-        known = np.isfinite(slopes) & (np.array([c for c, _ in SLOPES.values()]) == channel)
-        share, spread = sign * slopes[known], variance[known]
-        apart = shared_error(alike[known], spread)
-        middle, error = middle_share(share, spread, 0.0) if share.size else (0.0, np.inf)
-        found, odds = misstated(share, spread, stated, admitted if stated else 0.0, apart)
-        give = 0.0 if stated else possible_share(share, spread)
-        out[kind] = PadDoubt(found, odds, apart, give, force, (middle, float(np.hypot(error, apart))))
+        own = np.isfinite(slopes) & (np.array([c for c, _ in SLOPES.values()]) == channel)
+        shares, spread = sign * slopes[own], variance[own]
+        apart = shared_error(alike[own], spread)
+        middle, error = middle_share(shares, spread, 0.0) if shares.size else (0.0, np.inf)
+        share, odds = misstated(shares, spread, stated, admitted if stated else 0.0, apart)
+        give = 0.0 if stated else possible_share(shares, spread)
+        out[kind] = PadDoubt(share, odds, apart, give, force, (middle, float(np.hypot(error, apart))))
     return out
 
 
 def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int]) -> np.ndarray:
-    """Sampling variance (num_alignments, num_moves, 3) of the means, infinite of none."""
+    """Sampling variance (num_alignments, num_moves, 3) of the means, infinite where absent."""
     out = []
-    with np.errstate(divide="ignore", invalid="ignore"):  # of a channel without readings
+    with np.errstate(divide="ignore", invalid="ignore"):  # channels without readings
         for move in moves:
             part = {k: noise.variance[k] / n for k, n in weighed.weights.counts[move].items()}
             out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
@@ -383,10 +366,10 @@ def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int])
 
 
 def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndarray:
-    """What shares of model error are taken of (num_trials, num_moves, 3) [N, m, m].
+    """Units of the shares of model error (num_trials, num_moves, 3) [N, m, m].
 
-    Of a rise at least the give under the weight, and what it changed by in landing: what a pad does on
-    its way from one to the other need not cancel where contact forces balance.
+    That of a rise is at least the give under the weight, and the change of give in landing: what a pad does
+    in between need not cancel where contact forces balance.
     """
     force = np.abs(raw[..., FORCE]).mean(axis=1)
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
@@ -405,10 +388,10 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
 def free_means(
     weighed: Sequence[WeighedTrial], noise: Noise, free_steps: Sequence[int], rig: Rig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N].
+    """Mean forces in free motion (num_trials, 4), their variances, and the drift of each zero (4,) [N].
 
-    A zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
-    the rig's own bias allow, is no better known in a grip than these stretches differ.
+    A zero that drifts between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
+    the rig's own bias allow, is known in a grip no better than these stretches agree.
     """
     mean = np.stack([free_forces(a.signals, a) for a in weighed])
     count = np.array([max(a.weights.free_count, 1.0) for a in weighed])
@@ -419,7 +402,7 @@ def free_means(
 
 
 def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray, rig: Rig) -> np.ndarray:
-    """How far (4,) [N] a free stretch's forces are from the mean of all, at most; 0 if by noise."""
+    """Largest deviation (4,) [N] of a free stretch's forces from the mean of all; 0 if due to noise."""
     out = np.zeros(len(FORCE_CHANNELS))
     spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.weights.free > 0) for k in free_steps]
     for i, name in enumerate(FORCE_CHANNELS):
@@ -438,20 +421,19 @@ def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray
 
 
 def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
-    """Mean recorded rise [m] of the moves that should have none, where they were recorded."""
+    """Mean recorded rise [m] of the moves that should be level, where recorded."""
     level = {move: raw[:, :, move, RISE] for move, rise in rises.items() if not rise}
     return {move: float(np.nanmean(r)) for move, r in level.items() if np.isfinite(r).any()}
 
 
-BIASED = 0.0025  # prior: share of forces whose zero the rig has wrong: those of one recording in a hundred
+BIASED = 0.0025  # prior: share of forces with a wrong nominal zero: all four in one recording in a hundred
 
 
 def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
-    """Extra prior sd (4,) of force biases that free motion shows and the rig does not admit [N].
+    """Extra prior sd (4,) of force biases [N] that free motion shows and the rig does not admit.
 
-    Forces in free motion should vanish, but for noise and the rig's own [systematic]. A bias as wide as their
-    pooled mean explains that better by (z^2 - 1) / 2 - log z nats; it is allowed where that makes it likelier
-    than not.
+    Forces in free motion should vanish, up to noise and the rig's own [systematic]. A bias as wide as their
+    pooled mean explains that better by (z^2 - 1) / 2 - log z nats; it is allowed if that makes it probable.
     """
     precision = 1.0 / variance
     pooled = (mean * precision).sum(axis=0) / precision.sum(axis=0)
@@ -464,16 +446,15 @@ def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndar
 class Design:
     """Arrays of the linear-Gaussian core; K observations, Q unknowns, N deviations of the hand.
 
-    `mean`, `variance` (K,) of the observations, drawn alignments combined; `coefficients` (K, Q);
-    `shifts` (K, N) per standard deviation of each deviation; `channel` (K,) indexes CHANNELS;
-    `unit` (K,): what shares of model error are taken of; `trial`, `move` (K,): where it was seen;
-    `slope` (K,): whether a slope over the give rather than a mean (its shares are those of the mean).
-    `slope_sd` (3,): by channel, the error that all slopes have alike and each has of its own.
-    `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4, N): forces in
-    free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force biases
-    that free motion shows and the rig does not admit, `doubts`: the like of the pads; `level_rises`: by
-    move between equal heights, the mean rise that was recorded [m]; `moved` (4,): by how much the zeros
-    of forces move within a trial [N].
+    `mean`, `variance` (K,) of the observations, drawn alignments combined; `coefficients` (K, Q); `shifts`
+    (K, N) per standard deviation of each deviation; `channel` (K,): index into CHANNELS; `unit` (K,): of the
+    shares of model error; `trial`, `move` (K,): source; `slope` (K,): whether a slope over the give rather
+    than a mean (its shares are those of the mean). `slope_sd` (3,): by channel, the error common to all
+    slopes and that of each. `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4,
+    N): forces in free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force
+    biases that free motion shows and the rig does not admit; `doubts`: the same for the pads; `level_rises`:
+    mean recorded rise by move between equal heights [m]; `moved` (4,): drift of the forces' zeros within a
+    trial [N].
     """
 
     unknowns: tuple[Unknown, ...]
@@ -505,7 +486,7 @@ class Design:
         return tuple(u.name for u in self.unknowns)
 
     def repeats(self) -> np.ndarray:
-        """By channel (3,): means beyond the unknowns they determine, all that determine scatter."""
+        """By channel (3,): number of means in excess of the unknowns, which determine the scatter."""
         counts = np.bincount(self.channel[~self.slope], minlength=len(CHANNELS))
         return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
@@ -523,7 +504,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     )
     valid = np.isfinite(raw) & np.isfinite(variance)
     there = valid.mean(axis=1) > 0.5  # of the alignments
-    # A move between equal heights has a rise that no property enters: it says nothing of them.
+    # No property enters the rise of a move between equal heights.
     there[:, :, RISE] &= np.array([bool(rises[m]) for m in moves])
     unknowns = determined(task, objects, rises, there.any(axis=0))
     columns = coefficients_of(unknowns, objects, rises)  # M, 3, Q
@@ -534,7 +515,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     surprise = np.maximum(unexpected_bias(free_mean, free_variance, rig), moved)
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in weighed])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
-    slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # of channels that determine no unknown
+    slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # channels that determine no unknown
     slope_variance, alike = (
         np.stack(each) for each in zip(*(slope_variances(a, moves) for a in weighed), strict=True)
     )
@@ -548,7 +529,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     free_shifts = np.zeros((*free_mean.shape, len(deviations)))
     for j, deviation in enumerate(deviations):
         for i, (trial, a) in enumerate(zip(trials, weighed, strict=True)):
-            rate = 1.001 / float(np.median(np.diff(a.signals.t)))  # so that groups are as in these signals
+            rate = 1.001 / float(np.median(np.diff(a.signals.t)))  # thins into the same groups of samples
             read, per = thin(deviation.read(trial, rig, deviation.step), rate), deviation.sd / deviation.step
             shifts[i, ..., j] = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) * per
             slope_shifts[i, ..., j] = np.nan_to_num(slopes[i] - observe_slopes(read, a, rig, moves)) * per
@@ -577,9 +558,9 @@ def _combined(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means, variances (K,) and coefficients (K, Q) of the observations, drawn alignments combined.
 
-    Alignments are draws of what is missing, so the variance is that within one alignment plus
-    1 + 1 / S times that between them (Rubin 1987, Multiple Imputation, equation 3.1.5). What a
-    longer or shorter span changes in the coefficients is no difference between alignments.
+    Alignments are imputations, so the variance is that within one alignment plus 1 + 1 / S times that between
+    them (Rubin 1987, Multiple Imputation, equation 3.1.5). Differences that follow from the coefficients of a
+    longer or shorter span do not count as variation between alignments.
     """
     used = np.moveaxis(valid, 1, -1)[where]  # K, S
     num = used.sum(axis=1)

@@ -1,9 +1,9 @@
-"""Friction of the fingers against each block: its lower bound, and its value where a grip slipped.
+"""Friction of the fingers against each block: its lower bound, and its value if a grip slipped.
 
-Coulomb's law: |shear| <= mu x normal force in every held sample (the paper's Table 3 takes the
-largest ratio of the recorded ones). The bound here is the posterior of the largest true ratio
-(`largest_ratio`); a finger that slips (`slip_evidence`) is at the limit, so the bound is then mu itself.
-Where a block is slid, the net force gives the friction against its support (`ground_friction`).
+Coulomb's law: |shear| <= mu x normal force in every held sample (the paper's Table 3 takes the largest
+recorded ratio). The bound here is the posterior of the largest true ratio (`largest_ratio`); a finger that
+slips (`slip_evidence`) is at the limit, so the bound then equals mu. If a block is slid, the net force gives
+its friction against the support (`ground_friction`).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hmmseg.levels import CERTAIN, FIRM, SURE
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import acceleration
 
-FEWEST = 4  # numerics: samples of sliding
-WIDEST = 0.3  # chosen: relative sd beyond which the load varied too little
+FEWEST = 4  # numerics: least samples of sliding
+WIDEST = 0.3  # chosen: relative sd above which the load varied too little
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,10 @@ def ground_friction(
     weighed: Sequence[WeighedTrial], task: BlockTask, steps: tuple[Subtask, ...], obj: str, rig: Rig,
     weight: np.ndarray | None, rng: np.random.Generator,
 ) -> GroundFriction | None:  # fmt: skip
-    """Friction of a block on what it is slid on; None where it is not, or where that says too little.
+    """Friction of a block on the support it is slid on; None if it is not slid, or the data are insufficient.
 
-    The law d fx = mu (W - fy) + W d a / g is linear in mu where `weight`, draws (num_draws,) of W [N], is
-    known, and in mu W, mu and W where it is not. The last support counts where a task slides the block on
-    several.
+    The law d fx = mu (W - fy) + W d a / g is linear in mu if `weight`, draws (num_draws,) of W [N], is given,
+    and in mu W, mu and W otherwise. If a task slides the block on several supports, the last one counts.
     """
     slid = [s for s in steps if s.object == obj and s.state == SLIDING and s.move is not None]
     if not slid:
@@ -55,9 +54,9 @@ def ground_friction(
         return None
     if weight is None:
         columns = np.stack([-down, np.ones(push.size), lag], axis=1)
-        found, *_ = np.linalg.lstsq(columns, push, rcond=None)
-        mean, square = found[:1], float(np.linalg.pinv(columns.T @ columns)[0, 0])
-        left = push - columns @ found
+        fitted, *_ = np.linalg.lstsq(columns, push, rcond=None)
+        mean, square = fitted[:1], float(np.linalg.pinv(columns.T @ columns)[0, 0])
+        left = push - columns @ fitted
     else:
         weight = rng.choice(weight, (DRAWS, 1))
         right, pushed = weight - down, push - weight * lag
@@ -83,15 +82,15 @@ def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
     return np.stack([direction * (s.fx - bias_x), lag, s.fy - bias_y], axis=1)[sliding]
 
 
-PRIOR = 0.05  # prior: probability of slip before the anchors are seen
-STRAY = 0.1  # prior: share of stretches that move for reasons of their own: one alone proves nothing
-STRAY_DRIFT = 2e-3  # prior: m per root second
-SPEEDS = (5e-4, 1.5e-3, 5e-3)  # prior: m/s of a slipping pad
-STUCK = 0.5  # prior: probability that a pad near its limit holds all the same
+PRIOR = 0.05  # prior: probability of slip
+STRAY = 0.1  # prior: share of stretches that move for other reasons: one alone proves nothing
+STRAY_DRIFT = 2e-3  # prior: m per root second; drift of those
+SPEEDS = (5e-4, 1.5e-3, 5e-3)  # prior: m/s; of a slipping pad
+STUCK = 0.5  # prior: probability that a pad near its limit sticks nevertheless
 PERSISTENCE = 0.01  # prior: s over which the speed of a slipping pad varies
-DRIFTS = (0.0, 3e-5, 1e-4, 3e-4)  # prior: m per root second
-DRIFT_PRIOR = (0.5, 0.3, 0.15, 0.05)  # prior: of these: most pads hold still
-ANYWHERE = 0.01  # prior: m; prior sd of an anchor's height
+DRIFTS = (0.0, 3e-5, 1e-4, 3e-4)  # prior: m per root second; of an anchor without slip
+DRIFT_PRIOR = (0.5, 0.3, 0.15, 0.05)  # prior: probabilities of DRIFTS: most pads hold still
+ANYWHERE = 0.01  # prior: m; sd of an anchor's height
 NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
 
 
@@ -99,9 +98,9 @@ NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
 class Stretch:
     """One finger on one resting block, arrays (num_samples,).
 
-    `t` [s], `anchor` [m] (height less nominal shear deflection) and its noise `sd` [m], `shear`
-    [N], `ratio` of shear to normal force (signed) and its noise `ratio_sd`; `compliance` [m/N] is
-    the standard deviation of the pad's error.
+    `t` [s], `anchor` [m] (height less nominal shear deflection) and its noise `sd` [m], `shear` [N], signed
+    `ratio` of shear to normal force and its noise `ratio_sd`; `compliance` [m/N]: standard deviation of the
+    pad's compliance error.
     """
 
     t: np.ndarray
@@ -115,7 +114,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class SlipEvidence:
-    """Posterior probability of slip, the log Bayes factor behind it, and whether slip was seen."""
+    """Posterior probability of slip, the log Bayes factor behind it, and whether it counts as seen."""
 
     probability: float
     log_bayes_factor: float
@@ -125,20 +124,20 @@ class SlipEvidence:
 def slip_evidence(
     stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
 ) -> SlipEvidence:
-    """Slip of one block's grips, its coefficient being its bound: draws (num_draws,).
+    """Evidence for slip in one block's grips, whose coefficient is its bound: draws (num_draws,).
 
-    `others`: stretches with other blocks, which show how much anchors drift without slip.
+    `others`: stretches with other blocks, which show the drift of anchors without slip.
     """
     stretches = [s for s in stretches if s.t.size > 2]
-    every = _rescaled([*stretches, *(s for s in others if s.t.size > 2)])
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)
+    every = _rescaled([*stretches, *(s for s in others if s.t.size > 2)])
     own = every[: len(stretches)]
     stray = np.array([_log_density(s, STRAY_DRIFT) for s in every]) + np.log(STRAY)
     still = np.array([[_log_density(s, drift) for s in every] for drift in DRIFTS]) + np.log(1 - STRAY)
     still = np.logaddexp(still, stray)
     log_drift = np.log(np.asarray(DRIFT_PRIOR))
-    moved = np.repeat(still[None], 3, axis=0)
+    moved = np.repeat(still[None], 3, axis=0)  # (num_coefficients, num_drifts, num_stretches)
     for k, coefficient in enumerate(np.quantile(bound_draws, (0.1, 0.5, 0.9))):
         for i, s in enumerate(own):
             near = _near(s, float(coefficient))
@@ -154,7 +153,7 @@ def slip_evidence(
 
 
 def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
-    """Anchor noise raised to what second differences show, where the stated noise is too small."""
+    """Raise anchor noise to the level shown by second differences, if the stated noise is too small."""
     bends = [np.diff(s.anchor, 2) / s.sd[1:-1] for s in stretches if s.t.size > 3]
     if not bends:
         return stretches
@@ -163,13 +162,13 @@ def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
 
 
 def _near(s: Stretch, coefficient: float) -> np.ndarray:
-    """Whether the pad may slip from each sample to the next (num_samples - 1,): the shear's sign, or 0."""
+    """Whether the pad may slip between successive samples (num_samples - 1,): sign of the shear, or 0."""
     near = np.sign(s.ratio) * (np.abs(s.ratio) >= coefficient - NEAR * s.ratio_sd)
     return np.where(near[1:] != 0, near[1:], near[:-1])
 
 
 def _log_density(s: Stretch, drift: float, speed: float = 0.0, near: np.ndarray | None = None) -> float:
-    """Log density of the anchors under one drift and, while `near`, one speed of slip."""
+    """Log density of the anchors given one drift and, while `near`, one speed of slip."""
     t, shift = s.t - s.t[0], s.compliance * (s.shear - s.shear.mean())
     covariance = ANYWHERE**2 + np.outer(shift, shift) + drift**2 * np.minimum.outer(t, t)
     residual = s.anchor - np.median(s.anchor)
@@ -182,12 +181,12 @@ def _log_density(s: Stretch, drift: float, speed: float = 0.0, near: np.ndarray 
     return float(-0.5 * white @ white - np.log(np.diag(factor)).sum() - 0.5 * t.size * np.log(2 * np.pi))
 
 
-CONCENTRATION = 1.0  # prior: weight of G, in samples
-BINS_PER_SD = 3.0  # numerics: bins of G to the smallest noise
-MAX_BINS = 300  # numerics: of G at most: its cost is linear in them
-GLITCH = 0.01  # prior: share of samples that say nothing: a bound must rest on more than one
-BURN_IN, SWEEPS = 20, 48  # numerics: of Gibbs sampling: left out, and kept
-CORROBORATING = int(np.ceil(np.log(np.finfo(float).eps) / np.log(GLITCH)))  # of which not all are glitches
+CONCENTRATION = 1.0  # prior: weight of G's base measure, in samples
+BINS_PER_SD = 3.0  # numerics: bins of G per smallest noise sd
+MAX_BINS = 300  # numerics: most bins of G: the cost is linear in them
+GLITCH = 0.01  # prior: share of glitches: a bound must rest on more than one sample
+BURN_IN, SWEEPS = 20, 48  # numerics: of Gibbs sampling: discarded, and kept
+CORROBORATING = int(np.ceil(np.log(np.finfo(float).eps) / np.log(GLITCH)))  # samples, not all glitches
 REACH = 5.0  # numerics: standard deviations beyond which a sample cannot be the largest
 
 
@@ -196,15 +195,18 @@ def largest_ratio(
 ) -> np.ndarray:
     """Posterior draws (num_draws,) of the largest true ratio.
 
-    `ratio`, `sd` (num_samples,): measured absolute ratios and their noise; `held`
-    (num_alignments, num_samples): under which drawn alignment each sample counts. Alignments are
-    marginalised in the maximum; G is learned from the samples of all of them.
+    True ratios have an unknown distribution G, with a Dirichlet process prior on bins, and noise; a share
+    GLITCH of samples is uninformative.
+
+    `ratio`, `sd` (num_samples,): measured absolute ratios and their noise; `held` (num_alignments,
+    num_samples): under which drawn alignments each sample counts. Alignments are marginalised in the maximum;
+    G is learned from the samples of all of them.
     """
     end = float(np.max(ratio + REACH * sd))
     edges = np.linspace(0.0, end, int(np.clip(BINS_PER_SD * end / sd.min(), 20, MAX_BINS)) + 1)
     centres = (edges[1:] + edges[:-1]) / 2
-    # A Dirichlet's upper part is independent of how its lower part is split: samples that cannot
-    # be the largest enter by their number only.
+    # The upper part of a Dirichlet is independent of how the lower part is split, so samples that cannot be
+    # the largest enter by their number only.
     often = held.mean(axis=0)
     lower = np.sort(np.where(often == often.max(), ratio - REACH * sd, 0.0))
     cut = lower[-min(CORROBORATING, lower.size)]
@@ -212,7 +214,7 @@ def largest_ratio(
     top = centres > cut - REACH * sd[high].max()
     low_count = float((~high).sum()) + CONCENTRATION * float(np.mean(~top))
     prior = np.full(int(top.sum()), CONCENTRATION / centres.size)
-    # Of measured absolute ratios given the true ones (num_samples, num_bins).
+    # Likelihood of the measured absolute ratios given true ones (num_samples, num_bins).
     z = np.stack([sign * ratio[high][:, None] - centres[top] for sign in (1, -1)]) / sd[high][:, None]
     likelihood = np.exp(-0.5 * z**2).sum(axis=0) / (sd[high][:, None] * np.sqrt(2 * np.pi))
     log_likelihood = np.log(likelihood + 1e-300)
@@ -238,7 +240,7 @@ def largest_ratio(
 
 
 def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples in each bin (num_bins,) once every atom has been redrawn, its samples with it.
+    """Samples in each bin (num_bins,) after redrawing the location of every atom with its samples.
 
     Without this step an atom with many samples would never leave its bin.
     """
@@ -257,10 +259,9 @@ DRAWS = 2000  # numerics: of each coefficient
 class FrictionPosterior:
     """Friction coefficient of the fingers on one block.
 
-    `lower_bound` is the 5 % quantile of `bound_draws` (num_draws,), the posterior of the largest
-    ratio reached; None with a `reason` where the block was not held. `mu_draws` (num_draws,) only
-    where slip was seen; `reason` then is None and otherwise says why there is no value. `ground`
-    is the friction of the block on its support where it was slid.
+    `lower_bound`: 5 % quantile of `bound_draws` (num_draws,), the posterior of the largest ratio; None with a
+    `reason` if the block was not held. `mu_draws` (num_draws,) only if slip was seen, otherwise `reason`
+    tells why there is no value. `ground`: friction of the block on its support, if it was slid.
     """
 
     lower_bound: float | None
@@ -302,8 +303,8 @@ def friction_posteriors(
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
     """Friction of every object of the task, all trials pooled, alignments marginalised.
 
-    `sd_force`: noise of one force sample [N] where the signals do not state it; `weights`: posterior draws
-    of objects' weights [N].
+    `sd_force`: noise of one force sample [N] if the signals do not state it; `weights`: posterior draws of
+    objects' weights [N].
     """
     steps = subtasks(task)
     fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in weighed]
@@ -319,7 +320,7 @@ def friction_posteriors(
         draws = largest_ratio(*held[obj], rng, DRAWS)
         others = [s for other in task.objects if other != obj for s in resting[other]]
         slip = slip_evidence(resting[obj], others, draws)
-        gain = rig.systematic.force_gain  # an uncertain one stretches every ratio
+        gain = rig.systematic.force_gain  # its uncertainty scales every ratio
         worst = max(np.hypot(gain[0], gain[1]), np.hypot(gain[2], gain[3]))
         draws = draws * np.exp(worst * rng.standard_normal(DRAWS))
         reason = None if slip.seen else f"no finger was seen to slip on {obj}: a bound is all it tells"
@@ -330,9 +331,9 @@ def friction_posteriors(
 
 
 def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
-    """Forces of one finger less their mean in free motion, where they ought to vanish.
+    """Forces of one finger less their mean in free motion, where they should vanish.
 
-    What free motion shows beyond the sensors' noise counts as noise (a cable that pulls).
+    Variation in free motion beyond the sensors' noise (a cable that pulls) counts as noise.
     """
     free, stated = a.weights.free > 0, a.signals.sd_force
     stated = stated if np.isfinite(stated) else sd_force
@@ -356,7 +357,7 @@ def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
     """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment.
 
     While a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the ratio of
-    two small forces says little.
+    two small forces is uninformative.
     """
     recorded = np.isfinite(forces.normal + forces.shear)
     core = (holding.mean(axis=0) > 0.5) & recorded
@@ -367,7 +368,7 @@ def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
 
 
 def _ratio(forces: _Forces, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signed ratios of the samples in use and their noise, to first order."""
+    """Signed ratios of the selected samples and their noise, to first order."""
     ratio = forces.shear[use] / forces.normal[use]
     return ratio, np.hypot(forces.sd_shear, ratio * forces.sd_normal) / forces.normal[use]
 
@@ -399,7 +400,7 @@ def _stretches(
     obj: str,
     rig: Rig,
 ) -> list[Stretch]:
-    """Each finger on the resting block, samples that every alignment has there."""
+    """Each finger on the resting block, with the samples that all alignments share."""
     compliance = 1 / rig.fingertip.shear_stiffness
     out = []
     for a, pair in zip(weighed, fingers, strict=True):

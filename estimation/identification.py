@@ -1,8 +1,8 @@
-"""Block properties from trials: segmentation, posterior, friction, checks, in one result."""
+"""Block properties from aligned trials: posterior, friction and checks, in one result."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -35,18 +35,18 @@ from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
 
-LISTED = 3  # look: faults in a reason
+LISTED = 3  # look: most faults listed in a reason
 
 
 @dataclass(frozen=True, repr=False)
 class Identification(Tabled):
-    """Everything `identify` found.
+    """The result of `identify`.
 
-    `draws` (num_draws, num_properties) of the properties named by `names` (object, property) in
-    N and m, `combined` (num_draws, num_combinations) of the `combinations` that alone are determined
-    of some; `sampled` is None where nothing could be determined. `notes` say what a reader should
-    know though nothing is wrong. `centres`: posterior means of all that was worked out, what is contradicted
-    among it, from which a search for the cause starts [N, m].
+    `draws` (num_draws, num_properties) of the properties named by `names` (object, property) in N and m,
+    `combined` (num_draws, num_combinations) of the `combinations` that are determined only jointly; `sampled`
+    is None if nothing could be determined. `notes`: what a reader should know though nothing is wrong.
+    `centres` [N, m]: posterior means of all computed properties, contradicted ones included, from which a
+    search for the cause starts.
     """
 
     task: BlockTask
@@ -93,25 +93,27 @@ class Identification(Tabled):
 
     def to_json(self) -> dict:
         """The body of `identify`'s JSON document."""
-        properties, found, described = dict[str, dict](), self.sampled, decompose(self.task)
-        for obj in self.task.objects:
-            entry: dict = {}
-            for prop, unit in UNITS.items():
-                known = (obj, prop) in self.names
-                entry[prop] = summary(self.of(obj, prop), unit) if known else None
-                if known:
-                    entry[prop]["subtasks"] = source_subtasks(described, obj, prop)
-            friction = self.friction.get(obj)
-            entry["friction"] = None if friction is None else friction.to_json()
-            properties[obj] = entry
+        draws, described = self.sampled, decompose(self.task)
+
+        def entry(obj: str, prop: str) -> dict | None:
+            if (obj, prop) not in self.names:
+                return None
+            subtasks = source_subtasks(described, obj, prop)
+            return summary(self.of(obj, prop), UNITS[prop]) | {"subtasks": subtasks}
+
+        friction = {obj: self.friction[obj].to_json() if obj in self.friction else None
+                    for obj in self.task.objects}  # fmt: skip
         return {
             "trials": [s.to_json() for s in self.segmentations],
             "method": "bayes",
-            "sampler": None if found is None else {
-                "walkers": found.chain.shape[0], "steps": found.steps, "ess": found.ess, "rhat": found.rhat,
-                "acceptance": found.acceptance, "converged": found.converged,
+            "sampler": None if draws is None else {
+                "walkers": draws.chain.shape[0], "steps": draws.steps, "ess": draws.ess, "rhat": draws.rhat,
+                "acceptance": draws.acceptance, "converged": draws.converged,
             },
-            "properties": properties,
+            "properties": {
+                obj: {prop: entry(obj, prop) for prop in UNITS} | {"friction": friction[obj]}
+                for obj in self.task.objects
+            },
             "combinations": [
                 {"of": {f"{obj}.{u.prop}": c for obj, c in u.terms.items()}} | summary(column, UNITS[u.prop])
                 for u, column in zip(self.combinations, self.combined.T, strict=True)
@@ -126,31 +128,31 @@ class Identification(Tabled):
         return [properties_table(self.to_json())]
 
     def plot_estimates(self, actual: Actual | None = None, path: str | Path | None = None):
-        """Every property with its 68 and 95 % interval, against measured values where given; the axes."""
+        """Plot every property with its 68 and 95 % interval, against `actual` values if given; the axes."""
         from estimation.plots import draw_estimates
 
         return draw_estimates(self.to_json()["properties"], actual, None if path is None else Path(path))
 
     def plot_posterior(self, actual: Actual | None = None, path: str | Path | None = None):
-        """Corner plot of the joint posterior; its axes (num_properties, num_properties)."""
+        """Corner plot of the joint posterior; returns the axes (num_properties, num_properties)."""
         from estimation.plots import draw_corner
 
         return draw_corner(self.draws, self.names, None if path is None else Path(path), actual)
 
     def plot_check(self, trial: int = 0, path: str | Path | None = None):
-        """One trial's recorded samples in the band that the posterior predicts; the axes."""
+        """Plot one trial's samples with the predictive band of the posterior; returns the axes."""
         from estimation.plots import draw_check
 
         return draw_check(self, trial, None if path is None else Path(path))
 
     def to_pandas(self):
-        """Posterior draws as a DataFrame, a column `block.property` each [N, m]."""
+        """Posterior draws as a DataFrame, one column `block.property` each [N, m]."""
         import pandas as pd
 
         return pd.DataFrame(self.draws, columns=[".".join(name) for name in self.names])
 
     def to_arviz(self):
-        """The properties' posterior as ArviZ has it, dimensions (chain, draw)."""
+        """The properties' posterior in ArviZ's format, dimensions (chain, draw)."""
         if self.sampled is None:
             raise ValueError("no property was determined, so there is no posterior")
         chain = self.sampled.chain
@@ -163,50 +165,40 @@ def identify_aligned(
     aligned: AlignedTrials, seed: int = 0, progress: Callable[[int, int], None] | None = None
 ) -> Identification:
     """Properties of every block from aligned trials, pooled; `progress(steps_done, steps_at_most)`."""
-    rng, rig = np.random.default_rng(seed), aligned.rig
-    trials = [one.trial for one in aligned.trials]
+    rng, rig, task = np.random.default_rng(seed), aligned.rig, aligned.task
     weighed, noise = aligned_weights(aligned, rng)
-    sd_force = rig.noise.force or aligned.fit.parameters.scale["force"]
     design = build(aligned, weighed, noise)
-    warnings, notes = misfits(aligned), []
-    predictive, scale = None, None
-    found = posterior(design) if design.unknowns else None
-    sampled = None if found is None else sample(found, seed, progress)
-    weights = {}
-    if sampled is not None and sampled.converged:
-        weights = {u.name[0]: sampled.flat[:, i] for i, u in enumerate(design.unknowns) if u.prop == "weight"}
-    friction = friction_posteriors(weighed, aligned.task, rig, sd_force, rng, weights)
-    hidden = {name: reason for trial in trials for name, reason in trial.hidden.items()}
-    if "friction" in hidden:
-        friction = {obj: FrictionPosterior(None, reason=hidden["friction"], ground=f.ground)
-                    for obj, f in friction.items()}  # fmt: skip
+    post = posterior(design) if design.unknowns else None
+    sampled = None if post is None else sample(post, seed, progress)
+    friction = _friction(aligned, weighed, design, sampled, rng)
     reasons = _reasons(aligned, design, friction)
-    kept: list[int] = []
-    contradicted: dict[str, str] = {}
-    if found is not None and sampled is not None and sampled.converged:
-        predictive = check(found, sampled, rng)
+    predictive, contradicted, centres, kept = None, {}, {}, list[int]()
+    warnings, notes = misfits(aligned), list[str]()
+    if post is not None and sampled is not None and sampled.converged:
+        predictive = check(post, sampled, rng)
         warnings += predictive.warnings
-        notes += [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
+        notes = [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
         contradicted = contradictions(aligned, weighed, design)
         reasons |= contradicted | impossible(design, sampled)
         kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
-        scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
+        centres = {u.name: float(sampled.flat[:, i].mean()) for i, u in enumerate(design.unknowns)
+                   if u.single and i not in sampled.impossible}  # fmt: skip
     elif sampled is not None:
         why = f"the sampler has not converged: {sampled.shortfall}"
         warnings.append(why)
         reasons |= {".".join(u.name): why for u in design.unknowns if u.single}
-    unknowns, centres = tuple(design.unknowns[i] for i in kept), dict[tuple[str, str], float]()
-    if sampled is not None:
-        if sampled.converged:
-            centres = {u.name: float(sampled.flat[:, i].mean()) for i, u in enumerate(design.unknowns)
-                       if u.single and i not in sampled.impossible}  # fmt: skip
+    unknowns = tuple(design.unknowns[i] for i in kept)
+    draws = np.zeros((0, 0))
+    if sampled is not None and kept:
         chain, heavy = sampled.chain[..., kept], [i for i, u in enumerate(unknowns) if u.prop == "weight"]
+        scale = None if aligned.late else force_scale(design.doubts, weighed, rig)
         if scale is not None and heavy:
             chain = scale.corrected(chain, heavy, rng)
             warnings.append(scale.remark())
         sampled = replace(sampled, chain=chain)
-    draws = np.zeros((0, 0)) if sampled is None or not kept else sampled.flat
+        draws = sampled.flat
     num = sum(u.single for u in unknowns)  # singles come first
+    means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(unknowns) if u.single}
     warnings += [
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
@@ -215,24 +207,37 @@ def identify_aligned(
         f"the zero of {name} moves by {size:.2g} N between stretches of free motion; intervals allow for it"
         for name, size in zip(FORCE_CHANNELS, design.moved, strict=True) if size > 0
     ]  # fmt: skip
-    warnings += list(dict.fromkeys(contradicted.values()))
-    warnings += soft_pads(design, rig)
-    warnings += unnamed(aligned.task, design)
-    means = {u.name: float(draws[:, i].mean()) for i, u in enumerate(unknowns) if u.single}
-    warnings += dense(aligned.task, rig, means)
-    centres |= means
+    warnings += dict.fromkeys(contradicted.values())
+    warnings += [*soft_pads(design, rig), *unnamed(task, design), *dense(task, rig, means)]
     friction = {
         k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
     }
     return Identification(
-        aligned.task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
+        task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
         draws[:, :num], unknowns[num:], draws[:, num:], sampled if kept else None, friction, reasons,
-        predictive, tuple(warnings), tuple(notes), centres,
+        predictive, tuple(warnings), tuple(notes), centres | means,
     )  # fmt: skip
 
 
+def _friction(
+    aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design, sampled: Draws | None,
+    rng: np.random.Generator,
+) -> dict[str, FrictionPosterior]:  # fmt: skip
+    """Friction of every object, given draws of the weights; without values if a recording hides it."""
+    weights = {}
+    if sampled is not None and sampled.converged:
+        weights = {u.name[0]: sampled.flat[:, i] for i, u in enumerate(design.unknowns) if u.prop == "weight"}
+    sd_force = aligned.rig.noise.force or aligned.fit.parameters.scale["force"]
+    friction = friction_posteriors(weighed, aligned.task, aligned.rig, sd_force, rng, weights)
+    for trial in aligned.trials:
+        if "friction" in trial.trial.hidden:
+            friction = {obj: FrictionPosterior(None, reason=trial.trial.hidden["friction"], ground=f.ground)
+                        for obj, f in friction.items()}  # fmt: skip
+    return friction
+
+
 def impossible(design: Design, sampled: Draws) -> dict[str, str]:
-    """Why properties that could be worked out are none: by `object.property`, those that no block has."""
+    """Why computed properties are rejected, by `object.property`: values that no block has."""
     out = {}
     for i, u in ((i, design.unknowns[i]) for i in sampled.impossible):
         size = f"{float(sampled.flat[:, i].mean()):.3g} {UNITS[u.prop]}"
@@ -242,7 +247,7 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
 
 
 def source_subtasks(described: Decomposition, obj: str, prop: str) -> list[str]:
-    """Names of the subtasks whose samples determine this property, as `carry block1`."""
+    """Names of the subtasks whose samples determine this property, such as `carry block1`."""
     evidence = described.properties[obj][prop].evidence
     return list(dict.fromkeys(described.subtasks[k].label for one in evidence for k in one.subtasks))
 
@@ -260,9 +265,8 @@ def _reasons(
             reason = described.properties[obj][prop].reason
             needed = source_subtasks(described, obj, prop)
             out[f"{obj}.{prop}"] = reason or _not_recorded(aligned, obj, needed)
-        known = friction.get(obj)
-        if known is None or known.lower_bound is None:
-            out[f"{obj}.friction"] = known.reason if known else f"{obj} is never held"
+        if friction[obj].lower_bound is None:
+            out[f"{obj}.friction"] = friction[obj].reason
     return out
 
 

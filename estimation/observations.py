@@ -1,15 +1,15 @@
-"""What aligned trials say of the blocks: one robust mean a grip and channel, for many alignments.
+"""Observations of block properties from aligned trials: one robust mean per grip and channel.
 
-Three observations a grip (the span from pickup to place of one move):
+Each grip (from pickup to place of one move) gives three observations:
 
 - `force`: mean net vertical force over the carry [N];
-- `distance`: mean distance of the fingers while held, the pads' squeeze taken out [m];
-- `rise`: mean height of the fingers over the place less that over the pickup, the pads' shear
-  deflection taken out [m].
+- `distance`: mean distance of the fingers while held, corrected for the pads' squeeze [m];
+- `rise`: mean height of the fingers over the place minus that over the pickup, corrected for the pads' shear
+  deflection [m].
 
-Means are Student-t weighted; their sampling variance is the sandwich estimate psi^2 / psi'^2
-pooled over grips, with the integrated autocorrelation time of the residuals (Huber 1964; Sokal
-1997; docs/properties.md). Each of the drawn alignments gives every sample to one subtask.
+Means are Student-t weighted; their sampling variance is the sandwich estimate psi^2 / psi'^2 pooled over
+grips, with the integrated autocorrelation time of the residuals (Huber 1964; Sokal 1997; docs/properties.md).
+Each drawn alignment assigns every sample to one subtask.
 """
 
 from __future__ import annotations
@@ -32,18 +32,17 @@ from hmmseg.segmentation.emissions import acceleration, thin
 from hmmseg.tables import Brief
 
 FARTHEST_LAG = 11  # numerics: samples; autocorrelations beyond are noise
-MIN_STRETCH = 0.5  # numerics: samples; white noise has one, and a short series may seem to have less
-LEAST = 1e-8  # numerics: m or N: noise of a sample is no less, which keeps rounding out of the posterior
-# prior: samples that a stated noise is worth: it is off by a factor of two once in twenty
-STATED = 4.0
+MIN_STRETCH = 0.5  # numerics: samples; least autocorrelation time: white noise has 1, a short series less
+LEAST = 1e-8  # numerics: m or N; least noise of a sample, which keeps rounding out of the posterior
+STATED = 4.0  # prior: samples that a stated noise is worth: it is off by a factor of two once in twenty
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of one effective sample and the number it was learned from.
+    """Variance of one effective sample, and the number of samples that it was estimated from.
 
-    Of each kind of mean of a grip ("force", "distance", "pickup", "place"), and of each force in
-    free motion by its name.
+    By the kind of mean of a grip ("force", "distance", "pickup", "place"), and by force channel in free
+    motion.
     """
 
     variance: dict[str, float]
@@ -51,9 +50,9 @@ class Noise:
 
 
 def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str, float]:
-    """Noise that the rig states of one sample behind each mean [N, m], the median; NaN where it states none.
+    """Nominal noise of one sample behind each mean [N, m], the median over samples; NaN if unstated.
 
-    Of a sensor in the wrist, whose fingers are made up, nothing is stated.
+    Empty for a sensor in the wrist, whose fingers are virtual.
     """
     pads, out = pads_of(aligned.rig), dict[str, float]()
     if any(one.trial.inertia is not None for one in aligned.trials):
@@ -70,24 +69,23 @@ def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str,
 def learned(pooled: dict[str, list], scales: dict[str, float], stated: dict[str, float]) -> Noise:
     """Noise of each channel from residuals and their weights, pooled over grips.
 
-    `stated`: standard deviations of one sample, where they are known.
+    `stated`: standard deviations of one sample, where known.
     """
     variance, count = {}, {}
     for key, pairs in pooled.items():
         pairs = [(r[np.isfinite(r)], w[np.isfinite(r)]) for r, w in pairs]
         pairs = [(r, w) for r, w in pairs if r.size > 1]
         if not pairs:
-            known = np.isfinite(stated.get(key, np.nan))
-            variance[key], count[key] = (stated[key] ** 2, STATED) if known else (scales[key] ** 2, 1.0)
+            is_stated = np.isfinite(stated.get(key, np.nan))
+            variance[key], count[key] = (stated[key] ** 2, STATED) if is_stated else (scales[key] ** 2, 1.0)
             continue
         psi = np.concatenate([w * r for r, w in pairs])
         z2 = np.concatenate([(r / scales[key]) ** 2 for r, _ in pairs])
         slope = np.mean((TAIL + 1) * (TAIL - z2) / (TAIL + z2) ** 2)
-        # One location a grip was fitted: correct for the lost degrees of freedom.
+        # One location per grip was fitted: correct for the lost degrees of freedom.
         lost = psi.size / max(psi.size - len(pairs), 1)
         stretch = autocorrelation_time([w * r for r, w in pairs])
-        found = float(np.mean(psi**2) / slope**2 * lost * stretch)
-        variance[key] = max(found, LEAST**2)
+        variance[key] = max(float(np.mean(psi**2) / slope**2 * lost * stretch), LEAST**2)
         count[key] = float(max(psi.size - len(pairs), 1) / stretch)
         if variance[key] < stated.get(key, 0.0) ** 2:
             total = STATED + count[key]
@@ -99,10 +97,10 @@ def learned(pooled: dict[str, list], scales: dict[str, float], stated: dict[str,
 def autocorrelation_time(series: list[np.ndarray]) -> float:
     """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH.
 
-    Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of
-    lags (0, 1), (2, 3), ... up to the first pair that is not positive. Below 1 where successive
-    residuals cancel, as differentiated noise does. Series about their own mean are biased by
-    -1 / length, which is put back.
+    Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of lags (0,
+    1), (2, 3), ... up to the first pair that is not positive. Below 1 if successive residuals cancel, as in
+    differentiated noise. Autocorrelations of series about their own mean are biased by -1 / length, which is
+    corrected.
     """
     power, size = sum(float(r @ r) for r in series), sum(r.size for r in series)
     bias = len(series) / max(size, 1)
@@ -124,8 +122,8 @@ def autocorrelation_time(series: list[np.ndarray]) -> float:
             break
         total += 2 * pair
         lags = lag + 1
-    # Estimated from few samples, the excess over white noise is mostly noise itself: its variance is
-    # about 4 / size a lag, and it is shrunk by that (positive-part James and Stein 1961).
+    # From few samples, the excess over white noise is mostly noise, of variance about 4 / size per lag; it is
+    # shrunk accordingly (positive-part James and Stein 1961).
     excess = total - 1
     if excess != 0 and size:
         total = 1 + excess * max(0.0, 1 - 4 * lags / size / excess**2)
@@ -133,21 +131,21 @@ def autocorrelation_time(series: list[np.ndarray]) -> float:
 
 
 CHANNELS = ("force", "distance", "rise")
+KEYS = ("force", "distance", "pickup", "place")  # the means of a grip; a rise is place less pickup
 NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd
-APART = 0.1  # chosen: s by which one finger touches or lets go after the other, at most
-MIN_FREE = 8  # numerics: samples of free motion that determine the scale of the forces there
+APART = 0.1  # chosen: s; longest time between the two fingers' touches or releases
+MIN_FREE = 8  # numerics: least samples of free motion to estimate the scale of forces
 
 
 @dataclass(frozen=True, repr=False)
 class Weights(Brief):
     """Sample weights (num_alignments, num_timesteps) of each grip's means in one trial.
 
-    `grips[m]` maps "force", "distance", "pickup" and "place" to weights that sum to 1 over the
-    samples (0 everywhere: nothing recorded), `counts[m]` to effective sample numbers
-    (num_alignments,); `free` are weights (num_timesteps,) over free motion, `free_robust`
-    (4, num_timesteps) those of each force, which a finger that touches early does not sway.
-    `slopes[m]` maps "distance" and "rise" to slopes over the pads' give within the grip, and "landing" to
-    that of heights from the touch to the place, where seen.
+    `grips[m]` maps "force", "distance", "pickup" and "place" to weights that sum to 1 over the samples (all
+    0: nothing recorded), `counts[m]` to effective sample numbers (num_alignments,); `free`: weights
+    (num_timesteps,) over free motion, `free_robust` (4, num_timesteps): those of each force, robust to a
+    finger that touches early. `slopes[m]` maps "distance" and "rise" to slopes over the pads' give within the
+    grip, and "landing" to that of heights from the touch to the place, where seen.
     """
 
     grips: dict[int, dict[str, np.ndarray]]
@@ -159,7 +157,7 @@ class Weights(Brief):
 
 
 def draw_boundaries(trial: TrialAlignment, rng: np.random.Generator, num: int) -> np.ndarray:
-    """Boundary times (num, num_subtasks - 1) drawn from their posteriors, kept in order [s]."""
+    """Boundary times (num, num_subtasks - 1) [s] drawn from their posteriors, kept in order."""
     columns = []
     for boundary in trial.boundaries:
         cumulative = np.cumsum(boundary.probabilities)
@@ -168,7 +166,7 @@ def draw_boundaries(trial: TrialAlignment, rng: np.random.Generator, num: int) -
 
 
 def channel_values(signals: Signals, rig: Rig) -> dict[str, np.ndarray]:
-    """The sample values behind each mean, arrays (num_timesteps,)."""
+    """Sample values behind each mean, arrays (num_timesteps,)."""
     s, pads = signals, pads_of(rig)
     width = block_width(s.distance, s.fx1, s.fx2, pads)
     height = block_y(s.y, s.fy1, s.fy2, pads)
@@ -176,7 +174,7 @@ def channel_values(signals: Signals, rig: Rig) -> dict[str, np.ndarray]:
 
 
 def gravity_factor(signals: Signals, rig: Rig) -> np.ndarray:
-    """1 + a / g (num_timesteps,): the net force of a carried block in units of its weight."""
+    """1 + a / g (num_timesteps,): net force of a carried block in units of its weight."""
     return inertia_factor(np.nan_to_num(acceleration(signals.t, signals.vy)), rig.gravity)
 
 
@@ -195,9 +193,9 @@ def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
 
 
 def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
-    """Of the subtasks that a recording shows (num_subtasks,), those whose samples determine properties.
+    """Which of the subtasks shown (num_subtasks,) have samples that determine properties.
 
-    A grip before a carry that never came held who knows what.
+    A grip without its carry may hold anything.
     """
     out = present.copy()
     for carry in steps:
@@ -210,13 +208,13 @@ def robust_weights(
     values: np.ndarray, mask: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Student-t weights (num_timesteps,), residuals and location of the masked values."""
-    there = mask & np.isfinite(values)
-    if not there.any():
+    chosen = values[mask & np.isfinite(values)]
+    if not chosen.size:
         return np.zeros_like(values), np.full_like(values, np.nan), np.nan
-    centre = float(np.median(values[there]))
+    centre = float(np.median(chosen))
     for _ in range(20):
-        weight = (TAIL + 1) / (TAIL + ((values[there] - centre) / scale) ** 2)
-        centre = float(weight @ values[there] / weight.sum())
+        weight = (TAIL + 1) / (TAIL + ((chosen - centre) / scale) ** 2)
+        centre = float(weight @ chosen / weight.sum())
     residual = values - centre
     weights = (TAIL + 1) / (TAIL + (residual / scale) ** 2)
     return np.where(np.isfinite(values), weights, 0.0), residual, centre
@@ -224,7 +222,7 @@ def robust_weights(
 
 @dataclass(frozen=True, repr=False)
 class WeighedTrial(Brief):
-    """One trial thinned for estimation: signals, drawn alignments' masks and mean weights."""
+    """One trial thinned for estimation: signals, subtask masks of drawn alignments, and weights of means."""
 
     signals: Signals
     masks: np.ndarray
@@ -233,8 +231,8 @@ class WeighedTrial(Brief):
 
 def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[list[WeighedTrial], Noise]:
     """Weights of every grip's means for drawn alignments, and the noise of each channel."""
-    steps, rig = aligned.subtasks, aligned.rig
-    prepared, felt, touches = [], [], []  # felt: what the fingers press with is measured
+    steps, rig, prepared = aligned.subtasks, aligned.rig, []
+    members = {m: _members(steps, m) for m in sorted({s.move for s in steps if s.move is not None})}
     for trial in aligned.trials:
         thinned = thin(trial.signals)
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
@@ -242,79 +240,80 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
         best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]
         present = held_as_described(trial.present, steps)
         masks = subtask_masks(thinned.t, drawn, len(steps)) & present[None, :, None]
-        prepared.append((thinned, best & present[:, None], masks))
-        felt.append("friction" not in trial.trial.hidden)
-        touches.append([(boundary.mean, boundary.sd) for boundary in trial.boundaries])
-    moves = sorted({s.move for s in steps if s.move is not None})
+        readings = channel_values(thinned, rig)
+        readings["force"] = readings["force"] / gravity_factor(thinned, rig)
+        prepared.append((thinned, readings, best & present[:, None], masks))
+    scales = {}
+    for key in KEYS:
+        groups = [of[key] for of in members.values()]
+        scales[key] = _scale([(readings[key], best) for _, readings, best, _ in prepared], groups)
+    pooled: dict[str, list] = {key: [] for key in (*KEYS, *FORCE_CHANNELS)}
     landings = [(a, b) for a, b in pairwise(steps) if (a.state, b.state) == (ABOVE_GROUND, ON_GROUND)]
     touched = {b.move: a.index for a, b in landings}
-    keys = ("force", "distance", "pickup", "place")
-    scales = {key: _scale(prepared, steps, moves, key, rig) for key in keys}
-    pooled: dict[str, list] = {key: [] for key in keys}
-    out = []
-    for (thinned, best, masks), squeezed, moments in zip(prepared, felt, touches, strict=True):
-        values, factor = channel_values(thinned, rig), gravity_factor(thinned, rig)
-        grips, counts = {}, {}
-        for move in moves:
-            grips[move], counts[move] = {}, {}
-            for key, members in _members(steps, move).items():
-                chosen = best[members].any(axis=0)
-                v = values[key] / factor if key == "force" else values[key]
-                weight, residual, _ = robust_weights(v, chosen, scales[key])
+    weighed = []
+    for trial, (thinned, readings, best, masks) in zip(aligned.trials, prepared, strict=True):
+        grips, counts, slopes = {}, {}, {}
+        for move, of in members.items():
+            grips[move], counts[move], groups = {}, {}, {}
+            for key, indices in of.items():
+                groups[key] = chosen = best[indices].any(axis=0)
+                weight, residual, _ = robust_weights(readings[key], chosen, scales[key])
                 pooled[key].append((residual[chosen], weight[chosen]))
-                every = masks[:, members].any(axis=1) * weight
-                total = every.sum(axis=1, keepdims=True)
-                grips[move][key] = every / np.where(total > 0, total, 1.0)
-                counts[move][key] = (every > 0).sum(axis=1)
-        free = best[[s.index for s in steps if s.state == FREE]].any(axis=0)
-        free &= np.isfinite(thinned.fx1 + thinned.fy1 + thinned.fx2 + thinned.fy2)
-        # Next to a contact change one finger alone may touch, and a sample be contact already.
-        margin = 1 + int(np.ceil(APART / float(np.median(np.diff(thinned.t)))))
-        free &= np.convolve(~free, np.ones(2 * margin + 1), "same") == 0
+                each = masks[:, indices].any(axis=1) * weight
+                total = each.sum(axis=1, keepdims=True)
+                grips[move][key] = each / np.where(total > 0, total, 1.0)
+                counts[move][key] = (each > 0).sum(axis=1)
+            slopes[move] = slopes_within(thinned, readings, groups, scales, rig)
+            if move in touched:
+                k, place, give = touched[move], grips[move]["place"].mean(axis=0), shear_give(thinned, rig)
+                touch = trial.boundaries[k].mean, trial.boundaries[k].sd
+                shown = landing(thinned.t, readings["place"], give, place, touch, best[k], scales["place"])
+                slopes[move] |= {} if shown is None else {"landing": shown}
+            if "friction" in trial.trial.hidden:  # the grip force is not measured
+                slopes[move].pop("distance", None)
+        free = _free_samples(thinned, best[[s.index for s in steps if s.state == FREE]].any(axis=0))
         robust = np.zeros((len(FORCE_CHANNELS), free.size))
         for row, name in zip(robust, FORCE_CHANNELS, strict=True):
             force = getattr(thinned, name)
-            if free.sum() < MIN_FREE:  # where there is next to no free motion, what the rig states
+            if free.sum() < MIN_FREE:  # too few samples to estimate the scale
                 scale = thinned.sd_force if np.isfinite(thinned.sd_force) else 1.0
             else:
                 scale = max(robust_sd(force[free] - np.median(force[free])), 1e-9)
             weight, residual, _ = robust_weights(force, free, scale)
             row[:] = np.where(free, weight, 0.0) / max(weight[free].sum(), 1e-9)
             scales[name] = max(scales.get(name, 0.0), scale)
-            pooled.setdefault(name, []).append((residual[free], weight[free]))
-        slopes = {}
-        for m in moves:
-            members = _members(steps, m)
-            groups = {k: np.asarray(best[i].any(axis=0)) for k, i in members.items() if k != "force"}
-            slopes[m] = slopes_within(thinned, values, groups, scales, rig)
-            if m in touched:
-                k, place, give = touched[m], grips[m]["place"].mean(axis=0), shear_give(thinned, rig)
-                found = landing(thinned.t, values["place"], give, place, moments[k], best[k], scales["place"])
-                slopes[m] |= {} if found is None else {"landing": found}
-        if not squeezed:
-            slopes = {m: {k: v for k, v in of.items() if k != "distance"} for m, of in slopes.items()}
+            pooled[name].append((residual[free], weight[free]))
         weights = Weights(grips, counts, free / max(free.sum(), 1), robust, float(free.sum()), slopes)
-        out.append(WeighedTrial(thinned, masks, weights))
-    return out, learned(pooled, scales, channel_sds([p[0] for p in prepared], aligned))
+        weighed.append(WeighedTrial(thinned, masks, weights))
+    return weighed, learned(pooled, scales, channel_sds([w.signals for w in weighed], aligned))
 
 
-def free_forces(signals: Signals, aligned: WeighedTrial) -> np.ndarray:
-    """Mean forces (4,) in free motion [N], where they ought to vanish."""
+def _free_samples(s: Signals, free: np.ndarray) -> np.ndarray:
+    """Samples (num_timesteps,) of `free` motion with all forces, apart from contact changes.
+
+    Next to a change one finger may touch alone, or the sample already be in contact.
+    """
+    free = free & np.isfinite(s.fx1 + s.fy1 + s.fx2 + s.fy2)
+    margin = 1 + int(np.ceil(APART / float(np.median(np.diff(s.t)))))
+    return free & (np.convolve(~free, np.ones(2 * margin + 1), "same") == 0)
+
+
+def free_forces(signals: Signals, weighed: WeighedTrial) -> np.ndarray:
+    """Mean forces (4,) in free motion [N], where they should vanish."""
     force = np.stack([getattr(signals, name) for name in FORCE_CHANNELS])
-    return (aligned.weights.free_robust * np.nan_to_num(force)).sum(axis=1)
+    return (weighed.weights.free_robust * np.nan_to_num(force)).sum(axis=1)
 
 
-def _scale(prepared: list, steps: tuple[Subtask, ...], moves: list[int], key: str, rig: Rig) -> float:
-    """Robust scale of one channel's residuals, pooled over grips [unit of the channel]."""
+def _scale(trials: list[tuple[np.ndarray, np.ndarray]], groups: list[list[int]]) -> float:
+    """Robust scale of one channel's residuals, pooled over grips, each of a group of subtasks.
+
+    `trials`: readings (num_timesteps,) and subtask masks (num_subtasks, num_timesteps).
+    """
     residuals = []
-    for thinned, best, _ in prepared:
-        v = channel_values(thinned, rig)[key]
-        v = v / gravity_factor(thinned, rig) if key == "force" else v
-        for move in moves:
-            chosen = v[best[_members(steps, move)[key]].any(axis=0)]
+    for reading, best in trials:
+        for indices in groups:
+            chosen = reading[best[indices].any(axis=0)]
             chosen = chosen[np.isfinite(chosen)]
             if chosen.size > 2:
                 residuals.append(chosen - np.median(chosen))
-    if not residuals:
-        return 1.0
-    return max(robust_sd(np.concatenate(residuals)), 1e-9)
+    return max(robust_sd(np.concatenate(residuals)), 1e-9) if residuals else 1.0

@@ -1,4 +1,4 @@
-"""The paper's estimators: plain means over the subtasks (its Table 3), no optimality attempted.
+"""The paper's estimators: plain means over the subtasks (its Table 3), without any claim to optimality.
 
 - weight: mean net vertical force over the carry without its first and last 5 %
 - width: mean horizontal distance of the fingers over the carry
@@ -7,10 +7,9 @@
   squares, and for a move off or onto one block the height of that block
 - friction: the largest |fy1 / fx1| over pickup, carry or slide, and place; a lower bound
 
-Samples at which no holding state is identified are left out, as the paper has it. Estimates of
-several trials are averaged. The standard deviation is that of the samples (Table 4's), the
-standard error that of the mean as if samples were independent; what autocorrelation, inertia
-and pads do to it is not in it.
+Samples without an identified holding state are omitted, as in the paper. Estimates of several trials are
+averaged. The standard deviation is that of the samples (Table 4's), the standard error that of the mean of
+independent samples; the effects of autocorrelation, inertia and pads are not included.
 """
 
 from __future__ import annotations
@@ -29,13 +28,12 @@ from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import StateLabels, label_states
 
-TRIM = 0.05  # cited: share of the carry left out at either end of the weight estimate, by the paper
-
+TRIM = 0.05  # cited: share of the carry omitted at either end in the paper's weight estimate
 
 Properties = dict[str, dict[str, dict[str, Any] | None]]  # by object and property, as in identify's JSON
 
-# A mean over samples, their standard deviation and the mean's standard error (3,), and of which subtasks.
-Found = tuple[np.ndarray, list[str]]
+# A mean over samples, their standard deviation and the mean's standard error (3,), and the subtasks' labels.
+Estimate = tuple[np.ndarray, list[str]]
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class _Trial:
     spans: dict[int, tuple[float, float]]  # index of the subtask: start and end [s]
 
     def samples(self, step: Subtask, trim: float = 0.0) -> np.ndarray:
-        """Whether each sample is of the subtask and held (num_timesteps,), `trim` of it left off each end."""
+        """Samples of the subtask that are held (num_timesteps,), without a share `trim` at each end."""
         if step.index not in self.spans:
             return np.zeros(self.held.size, dtype=bool)
         (start, end), t = self.spans[step.index], self.signals.t
@@ -55,7 +53,7 @@ class _Trial:
         return self.held & (t >= start + cut) & (t < end - cut)
 
     def mean(self, name: str, step: Subtask, trim: float = 0.0) -> np.ndarray | None:
-        """Mean of a signal over these, sd and error; None of fewer than two, whose scatter is unknown."""
+        """Mean of a signal over these samples, their sd and its error; None for fewer than two samples."""
         values = getattr(self.signals, name)[self.samples(step, trim)]
         values = values[np.isfinite(values)]
         if values.size < 2:
@@ -73,14 +71,14 @@ def estimate_plugin(
     """The paper's estimates of every object of a task from its segmented trials.
 
     Args:
-        trials_signals: one a trial.
-        segmentations: one a trial.
+        trials_signals: one per trial.
+        segmentations: one per trial.
         task: of all trials.
         states: contact states of each trial's samples; by default those of the paper's thresholds.
 
     Returns:
-        Every property's entry in identify's JSON, with its `standard_error`, of which intervals are the
-        normal ones; and why those without have none, by `object.property`.
+        Every property's entry in identify's JSON, with its `standard_error` and normal intervals; and the
+        reason for each missing one, by `object.property`.
 
     Raises:
         ValueError: the sequences differ in length.
@@ -92,7 +90,7 @@ def estimate_plugin(
         _Trial(signals, label.state > 1, _matched(segmentation, steps))
         for signals, segmentation, label in zip(trials_signals, segmentations, labels, strict=True)
     ]
-    heights, known = _heights(trials, task, steps), decompose(task).properties
+    heights, described = _heights(trials, task, steps), decompose(task).properties
     properties: Properties = {}
     reasons: dict[str, str] = {}
     for name in task.objects:
@@ -105,10 +103,10 @@ def estimate_plugin(
             "friction": _friction(trials, grips),
         }
         for key in [key for key, value in properties[name].items() if value is None]:
-            shown = "no trial shows enough identified samples of the subtasks it needs"
+            otherwise = "no trial shows enough identified samples of the subtasks it needs"
             if key in ("weight", "width") and not carries:
-                shown = f"no move carries {name}, and the formula averages over a carry"
-            reasons[f"{name}.{key}"] = known[name][key].reason or shown
+                otherwise = f"no move carries {name}, and the formula averages over a carry"
+            reasons[f"{name}.{key}"] = described[name][key].reason or otherwise
     return properties, reasons
 
 
@@ -134,31 +132,33 @@ def _matched(segmentation: Segmentation, steps: tuple[Subtask, ...]) -> dict[int
     return matched
 
 
-def _means(trials: Sequence[_Trial], steps: Sequence[Subtask], name: str, trim: float) -> list[Found]:
-    found = [(trial.mean(name, step, trim), [step.label]) for trial in trials for step in steps]
-    return [(mean, labels) for mean, labels in found if mean is not None]
+def _means(trials: Sequence[_Trial], steps: Sequence[Subtask], name: str, trim: float) -> list[Estimate]:
+    means = [(trial.mean(name, step, trim), [step.label]) for trial in trials for step in steps]
+    return [(mean, labels) for mean, labels in means if mean is not None]
 
 
-def _pooled(key: str, found: Sequence[Found]) -> dict[str, Any] | None:
-    """Mean over the means, each with the same weight."""
-    if not found:
+def _pooled(key: str, estimates: Sequence[Estimate]) -> dict[str, Any] | None:
+    """Unweighted mean of the estimates."""
+    if not estimates:
         return None
-    means, sds, errors = np.array([each for each, _ in found]).T
-    mean, error = float(means.mean()), math.sqrt(np.sum(errors**2)) / len(found)
+    means, sds, errors = np.array([each for each, _ in estimates]).T
+    mean, error = float(means.mean()), math.sqrt(np.sum(errors**2)) / len(estimates)
     out = {"unit": UNITS[key], "mean": mean, "sd": math.sqrt(np.mean(sds**2)), "median": mean}
     for percent in (68, 95):
         half = float(ndtri(0.5 + percent / 200)) * error
         out[f"interval_{percent}"] = [mean - half, mean + half]
-    labels = dict.fromkeys(label for _, labels in found for label in labels)
+    labels = dict.fromkeys(label for _, labels in estimates for label in labels)
     return out | {"standard_error": error, "subtasks": list(labels)}
 
 
-def _heights(trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ...]) -> dict[str, list[Found]]:
+def _heights(
+    trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ...]
+) -> dict[str, list[Estimate]]:
     """Height of every object in each trial that determines it, by least squares.
 
-    Means are taken as independent; a height is its absolute value, as Table 3 has it.
+    Means are assumed independent; heights are absolute values, as in Table 3.
     """
-    found: dict[str, list[Found]] = {name: [] for name in task.objects}
+    heights: dict[str, list[Estimate]] = {name: [] for name in task.objects}
     for trial in trials:
         rows, rises, labels = [], [], []
         for move, rise in height_equations(task):
@@ -176,12 +176,12 @@ def _heights(trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ..
         for name, weights in zip(np.array(task.objects)[determined], inverse[determined], strict=True):
             combined = np.array([abs(weights @ mean), *(np.hypot.reduce(weights * v) for v in errors)])
             used = [own for own, weight in zip(labels, weights, strict=True) if abs(weight) > 1e-9]
-            found[name].append((combined, [label for own in used for label in own]))
-    return found
+            heights[name].append((combined, [label for own in used for label in own]))
+    return heights
 
 
 def _friction(trials: Sequence[_Trial], grips: Sequence[Subtask]) -> dict[str, Any] | None:
-    """The largest ratio that any grip shows."""
+    """The largest ratio in any grip."""
     shown = []
     for trial in trials:
         with np.errstate(divide="ignore", invalid="ignore"):

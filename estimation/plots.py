@@ -1,4 +1,4 @@
-"""Figures of an identification: the corner plot, estimates against measurements, and predicted signals."""
+"""Figures of an identification: corner plot, estimates against measurements, and predicted signals."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from hmmseg.segmentation.spans import Segmentation
 
 @dataclass(frozen=True)
 class Prediction:
-    """A recorded signal less what the model predicts of it, and the band of a new sample, (num_timesteps,).
+    """A recorded signal minus its prediction, and the predictive band of a new sample, (num_timesteps,).
 
-    `low` and `high` bound the central 90 % about 0, NaN where nothing is predicted; in units of the `label`.
+    `low` and `high` bound the central 90 % about 0, NaN without a prediction; in units of the `label`.
     """
 
     label: str
@@ -38,14 +38,14 @@ class Prediction:
 
     @property
     def coverage(self) -> float:
-        """Share of the predicted samples that lie in their band; NaN where there is none."""
+        """Share of the predicted samples inside their band; NaN if there are none."""
         there = np.isfinite(self.observed) & np.isfinite(self.low)
         inside = (self.observed >= self.low) & (self.observed <= self.high)
         return float(inside[there].mean()) if there.any() else float("nan")
 
 
 def predictions(found: Identification, trial: int) -> tuple[np.ndarray, list[Prediction]]:
-    """Times (num_timesteps,) [s] of one trial; its net vertical force and finger distance as predicted."""
+    """Times (num_timesteps,) [s] of one trial; its predicted net vertical force and finger distance."""
     weighed = found.weighed[trial]
     signals, masks = weighed.signals, weighed.masks.mean(axis=0) > 0.5
     factor = gravity_factor(signals, found.rig)
@@ -67,8 +67,8 @@ def predictions(found: Identification, trial: int) -> tuple[np.ndarray, list[Pre
     return signals.t, out
 
 
-SIZE = 1.25  # look: in, a panel
-LEFT, RIGHT = 0.95, 0.3  # look: in, margins (below and above alike)
+SIZE = 1.25  # look: in, of a panel
+LEFT, RIGHT = 0.95, 0.3  # look: in, margins (the same at bottom and top)
 WIDEST = 0.6  # look: share of a panel by which a measured value may widen its range
 
 
@@ -78,12 +78,11 @@ def draw_corner(
     path: Path | None = None,
     actual: Actual | None = None,
 ) -> np.ndarray:
-    """Posterior draws (num_draws, num_properties) of the (object, property) pairs, SI units.
+    """Corner plot of posterior draws (num_draws, num_properties) of the (object, property) pairs, SI units.
 
-    Contours hold 39, 68 and 95 % of the probability, dashed lines are the quantiles 2.5, 50 and
-    97.5 %. Measured values of `actual` are lines; one that lies far outside the draws is left out,
-    its panel saying so. Returns the axes (num_properties, num_properties); ValueError for draws of
-    another width than names.
+    Contours contain 39, 68 and 95 % of the probability, dashed lines are the 2.5, 50 and 97.5 % quantiles.
+    Measured values of `actual` are lines; one far outside the draws is omitted and stated in its panel.
+    Returns the axes (num_properties, num_properties); ValueError if draws and names differ in number.
     """
     if draws.ndim != 2 or draws.shape[1] != len(names):
         raise ValueError(f"draws of shape {draws.shape} for {len(names)} names")
@@ -127,19 +126,19 @@ ORDER = ("weight", "width", "height", "friction")
 def draw_estimates(
     properties: Mapping[str, Mapping[str, dict | None]], actual: Actual | None, path: Path | None = None
 ) -> Axes:
-    """One row a property: 68 and 95 % interval in % of the measured value, with the numbers next to it.
+    """Plot one row per property: 68 and 95 % interval in % of the measured value, with the numbers.
 
-    `properties` is the JSON of `identify`. Without a measured value the row is drawn about the
-    estimate itself (open marker); a property that is None or only bounded says so.
+    `properties` is the JSON of `identify`. Without a measured value the row is relative to the estimate
+    itself (open marker); a property that is None or only bounded says so.
     """
     rows = [(obj, key) for obj, entry in properties.items() for key in ORDER if key in entry]
     with canvas(path, height=1.1 + 0.27 * len(rows)) as figure:
         ax = figure.subplots()
-        reach = [0.0]
-        for y, (obj, key) in enumerate(rows):
-            measured = None if actual is None else actual.get(obj, {}).get(key)
-            reach.append(_draw_row(ax, y, key, properties[obj][key], measured))
-        limit = 1.08 * max(reach) or 1.0
+        reach = [
+            _draw_row(ax, y, key, properties[obj][key], (actual or {}).get(obj, {}).get(key))
+            for y, (obj, key) in enumerate(rows)
+        ]
+        limit = 1.08 * max(reach, default=0.0) or 1.0
         ax.set_xlim(-limit, limit)
         ax.axvline(0, color=INK, lw=0.6, zorder=0)
         ax.set_yticks(range(len(rows)), [f"{obj} {key}" for obj, key in rows])
@@ -204,9 +203,9 @@ def _against(measured: tuple[float, float] | None, factor: float) -> str:
 def draw_predictive(
     t: np.ndarray, shown: Sequence[Prediction], path: Path | None, segmentation: Segmentation
 ) -> list[Axes]:
-    """Recorded samples at t (num_timesteps,) [s] in predicted 90 % bands, a panel a signal.
+    """Plot recorded samples at t (num_timesteps,) [s] in predicted 90 % bands, one panel per signal.
 
-    Samples outside their band are marked; each panel says which share lies inside.
+    Samples outside their band are marked; each panel states the share inside.
     """
     with canvas(path, height=1.5 + 1.25 * len(shown)) as figure:
         axes = list(np.atleast_1d(figure.subplots(len(shown), 1, sharex=True)))
@@ -234,5 +233,5 @@ def draw_predictive(
 
 
 def draw_check(found: Identification, trial: int, path: Path | None = None) -> list[Axes]:
-    """One trial's recorded signals less what the fitted model predicts, in its band."""
+    """Plot one trial's recorded signals minus the fitted model's prediction, in its band."""
     return draw_predictive(*predictions(found, trial), path, found.segmentations[trial])

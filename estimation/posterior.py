@@ -1,19 +1,19 @@
-"""The posterior, all that enters linearly integrated out: a density of six scales.
+"""The posterior of six scales, with everything that enters linearly integrated out.
 
-Given the noise scale s_c and the share k_c of model error that differs from grip to grip, of each
-channel c, all else is jointly Gaussian: properties, deviations of the hand z and the share e_c of
-model error that all grips have alike,
+Given the noise scale s_c and the share k_c of model error that differs between grips, for each channel c,
+everything else is jointly Gaussian: properties q, deviations of the hand z, and the share e_c of model error
+common to all grips,
 
     mean = A q + J z + unit (e_c + own) + N(0, s_c^2 variance),        own ~ N(0, k_c^2),
     slope = J z + e_c + own + f_c + other + N(0, s_c^2 variance),        other ~ N(0, k_c^2),
-    z ~ N(0, 1) and as free motion has it,
+    z ~ N(0, 1), and forces in free motion,
     e_c ~ N(0, COMMON_c^2 + k_c^2),        f_c ~ N(0, slope_sd_c^2 + k_c^2).
 
-(What all grips have alike no repeat can show. It is at least what the prior says and at least as
-large as what differs between them. A slope shows the same shares as its grip's mean, but a grip that
-does not follow its equation is no reliable witness of it.) Unknowns have a flat prior in here; their own is
-put in when they are drawn (`estimation.sampler`). The density of the scales is written once for NumPy, which
-samples it, and JAX, which seeks its mode.
+(Repeated grips cannot show their common share. It is at least as large as its prior, and as the share that
+differs between grips. A slope shares the model error of its grip's mean, but a grip that deviates from its
+equation is no reliable witness of it.) Unknowns have a flat prior here; their own is applied when they are
+drawn (`estimation.sampler`). The density of the scales is written once for NumPy, which samples it, and JAX,
+which finds its mode.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ FARTHEST = 9.0  # limit: of any scale from its prior median, all logarithms
 
 
 class Model(NamedTuple):
-    """A design as one linear model of S coefficients b = (q, z, e, f); arrays of NumPy or JAX.
+    """A design as one linear model with S coefficients b = (q, z, e, f); arrays of NumPy or JAX.
 
     `residual` (K,) = `matrix` (K, S) b + noise of variance s^2 `variance` (K,) + (k `unit` (K,))^2, rows
-    independent; `of` (3, K): 1 where a row is of a channel. `products` (K, S (S + 1) / 2) of its columns.
-    `precision` (S, S), `gradient` (S,): what is known of b whatever the scales, by the deviations' prior and
-    free motion; `shares` (6, S): 1 where a coefficient is a share; `least` (6,): prior variances of the
-    shares where grips do not differ; `scale_sd` (3,): prior sds of log s.
+    independent; `of` (3, K): 1 if a row is of a channel. `products` (K, S (S + 1) / 2) of its columns.
+    `precision` (S, S), `gradient` (S,): information on b that does not depend on the scales, from the prior
+    of the deviations and free motion; `shares` (6, S): 1 if a coefficient is a share; `least` (6,): prior
+    variances of the shares if grips do not differ; `scale_sd` (3,): prior sds of log s.
     """
 
     residual: Any
@@ -59,8 +59,10 @@ class Model(NamedTuple):
 
 
 def normal_equations(theta: Any, model: Model, xp: ModuleType = np) -> tuple[Any, Any, Any]:
-    """Precision (W, S, S) of b given scales theta (W, 6), precision times mean (W, S), and the log density
-    (W,) that they leave out, up to a constant."""
+    """Precision (W, S, S) of b given scales theta (W, 6), precision times mean, and the rest of the density.
+
+    Precision times mean is (W, S); the log density (W,), up to a constant, is that of the terms without b.
+    """
     share = priors.SCATTER_MEDIAN[None] * xp.exp(theta[:, NUM_CHANNELS:])
     variance = xp.exp(2 * theta[:, :NUM_CHANNELS] @ model.of) * model.variance[None]
     weight = 1 / (variance + (share @ model.of * model.unit[None]) ** 2)
@@ -80,8 +82,8 @@ def normal_equations(theta: Any, model: Model, xp: ModuleType = np) -> tuple[Any
 def log_density(theta: Any, model: Model, xp: ModuleType = np) -> Any:
     """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant.
 
-    `xp`: numpy, or jax.numpy where theta and the model are JAX's. -inf beyond FARTHEST, where priors leave
-    nothing and digits would run out.
+    `xp`: numpy, or jax.numpy if theta and the model are JAX's. -inf beyond FARTHEST, where the priors are
+    negligible and precision would be lost.
     """
     near = xp.all(xp.abs(theta) <= FARTHEST, axis=1)
     theta = xp.clip(theta, -FARTHEST, FARTHEST)
@@ -99,7 +101,7 @@ def log_prior(theta: Any, scale_sd: Any, xp: ModuleType = np) -> Any:
 
 
 def padded(model: Model, rows: int, coefficients: int) -> Model:
-    """The same density with rows and coefficients that say nothing, so that their numbers are multiples."""
+    """The same density with uninformative rows and coefficients, so that their numbers are multiples."""
     k, s = -model.matrix.shape[0] % rows, -model.matrix.shape[1] % coefficients
     matrix, precision = np.pad(model.matrix, ((0, k), (0, s))), np.pad(model.precision, (0, s))
     added = np.arange(s) + len(model.precision)
@@ -124,7 +126,7 @@ BATCH = 256  # numerics: densities at once, to keep memory small
 class Posterior:
     """Posterior of a design; scales theta are log s_c (3) and log(k_c / its prior median) (3).
 
-    `reference` (Q,): least squares, about which all else is written to keep its digits.
+    `reference` (Q,): least-squares solution, subtracted from the unknowns to keep precision.
     """
 
     design: Design
@@ -132,12 +134,12 @@ class Posterior:
 
     @property
     def scale_sd(self) -> np.ndarray:
-        """Prior sd (3,) of log s: the variance was learned from so many samples."""
+        """Prior sd (3,) of log s, given the number of samples behind the variance."""
         return 1 / np.sqrt(2 * np.maximum(self.design.scale_count, 1.0))
 
     @cached_property
     def model(self) -> Model:
-        """What the density of the scales is worked out from."""
+        """The linear model behind the density of the scales."""
         rows, levers = independent(self.design)
         of = np.eye(NUM_CHANNELS)[rows.channel]
         shared = (of[:, None, :] * levers[:, :, None]).reshape(len(of), 2 * NUM_CHANNELS)
@@ -170,16 +172,17 @@ class Posterior:
 def posterior(design: Design) -> Posterior:
     """The posterior of a design that determines at least one unknown."""
     sd = np.sqrt(design.variance)
-    found, *_ = np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)
-    return Posterior(design, found)
+    return Posterior(
+        design, np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)[0]
+    )
 
 
 def independent(design: Design) -> tuple[Design, np.ndarray]:
-    """The design with each grip's mean and slopes turned into as many independent rows; levers (K, 2).
+    """Transform each grip's mean and slopes into as many independent rows, with levers (K, 2).
 
-    Their covariance is s^2 D + k^2 B, D diagonal, B = a a' + the slopes' own, a = unit of the mean, 1 of
-    slopes: the eigenvectors of D^-1/2 B D^-1/2 make both diagonal whatever s and k. New rows have the
-    variance of a grip's first row.
+    Their covariance is s^2 D + k^2 B, D diagonal, B = a a' + the slopes' own, where a is the unit for the
+    mean and 1 for slopes: the eigenvectors of D^-1/2 B D^-1/2 diagonalise both for all s and k. The new rows
+    have the variance of a grip's first row.
     """
     d = design
     lever = np.where(d.slope, 1.0, d.unit)
@@ -206,8 +209,8 @@ def independent(design: Design) -> tuple[Design, np.ndarray]:
 
 
 TOLERANCE, MAX_STEPS = 1e-6, 256  # numerics: relative and absolute, of scales and density
-PADDING = 32, 8  # numerics: rows and coefficients are rounded up so that few programs are compiled
-DIFFERENCE = 1e-3  # numerics: of the scales, all logarithms, for derivatives by central differences
+PADDING = 32, 8  # numerics: multiples for rows and coefficients, so that few programs are compiled
+DIFFERENCE = 1e-3  # numerics: step in the log scales for central differences
 STARTS = np.arange(-1.0, 9.0, 1.0)  # numerics: log(share / prior median); a large share is a mode of its own
 
 
@@ -215,7 +218,7 @@ STARTS = np.arange(-1.0, 9.0, 1.0)  # numerics: log(share / prior median); a lar
 class Mode:
     """Mode (6,) of the scales and their covariance (6, 6); unknowns (Q,) there and theirs (Q, Q).
 
-    The covariance of the unknowns holds at the scales' mode.
+    The covariance of the unknowns is conditional on the scales' mode.
     """
 
     scales: np.ndarray
@@ -227,29 +230,29 @@ class Mode:
 
 @double_precision
 def find_mode(post: Posterior) -> Mode:
-    """Mode by optimistix's BFGS from the best of a few shares a channel; curvature by central differences."""
+    """Mode by optimistix's BFGS from the best of a few shares per channel; curvature by differences."""
     steps = DIFFERENCE * np.eye(2 * NUM_CHANNELS)
 
     def gradient(x: np.ndarray) -> np.ndarray:
         up, down = np.split(post.log_prob(np.concatenate([x + steps, x - steps])), 2)
         return -(up - down) / (2 * DIFFERENCE)
 
-    found = np.array(_climb()(start_of(post), padded(post.model, *PADDING)))
-    hessian = np.array([(gradient(found + h) - gradient(found - h)) / (2 * DIFFERENCE) for h in steps])
+    mode = np.array(_climb()(start_of(post), padded(post.model, *PADDING)))
+    hessian = np.array([(gradient(mode + h) - gradient(mode - h)) / (2 * DIFFERENCE) for h in steps])
     values, vectors = np.linalg.eigh((hessian + hessian.T) / 2)
     covariance = (vectors / np.maximum(values, 0.1)) @ vectors.T
-    mean, chol = post.given(found[None])
+    mean, chol = post.given(mode[None])
     num = len(post.design.unknowns)
     factor = np.linalg.inv(chol[0])[:, :num]
-    slope = float(np.abs(gradient(found)).max())
-    return Mode(found, covariance, post.reference + mean[0, :num], factor.T @ factor, slope < 1e-2)
+    slope = float(np.abs(gradient(mode)).max())
+    return Mode(mode, covariance, post.reference + mean[0, :num], factor.T @ factor, slope < 1e-2)
 
 
 @lru_cache
 def _climb() -> Callable[[np.ndarray, Model], Any]:
-    """From a start (6,) to the density's next maximum (6,); one compiled program for each padded size.
+    """Map a start (6,) to the nearest maximum (6,) of the density; one compiled program per padded size.
 
-    On the processor, whatever accelerator there is: six scales are not worth the way there.
+    On the CPU in any case: six scales are not worth a transfer to an accelerator.
     """
     import jax  # these are slow to import
     import jax.numpy as jnp
@@ -263,7 +266,7 @@ def _climb() -> Callable[[np.ndarray, Model], Any]:
     def climb(start: Any, model: Model) -> Any:
         return optimistix.minimise(loss, solver, start, model, max_steps=MAX_STEPS, throw=False).value
 
-    # It runs for milliseconds: what optimising the program takes is more than what that could save.
+    # It runs for milliseconds, less than optimising the program would take.
     quickly_compiled = {"xla_backend_optimization_level": 0}
     program, processor = jax.jit(climb, compiler_options=quickly_compiled), jax.devices("cpu")[0]
 
@@ -275,7 +278,7 @@ def _climb() -> Callable[[np.ndarray, Model], Any]:
 
 
 def start_of(post: Posterior) -> np.ndarray:
-    """Scales (6,) from which to climb: each channel's share the best of STARTS, one after the other."""
+    """Initial scales (6,): each channel's share the best of STARTS, one after the other."""
     best = np.zeros(2 * NUM_CHANNELS)
     for c in range(NUM_CHANNELS):
         starts = np.repeat(best[None], STARTS.size, axis=0)

@@ -1,10 +1,10 @@
-"""Priors of properties and of what the contact equations leave out, with reasons in docs/properties.md.
+"""Priors of properties and of model error; reasons in docs/properties.md.
 
-Properties are log-normal: blocks that a 4 N pinch can carry and a 75 mm workspace holds, a
-factor of e^sd either way. They are wide: the recording decides.
+Properties are log-normal: a factor of e^sd around blocks that a 4 N pinch can carry and a 75 mm workspace
+holds. They are wide, so that the recording decides.
 
-Model error is a share of what each channel's equation is built on (`estimation.design`): the carried
-force, the pads' give along the grip, their shear deflection.
+Model error is a share of the quantity on which each channel's equation rests (`estimation.design`): the
+carried force, the pads' give along the grip, their shear deflection.
 """
 
 from __future__ import annotations
@@ -16,11 +16,9 @@ import numpy as np
 PROPERTY_MEDIAN = {"weight": 0.5, "width": 0.02, "height": 0.02}  # prior: N, m, m
 PROPERTY_LOG_SD = {"weight": 1.5, "width": 1.0, "height": 1.0}  # prior: a factor of 3 to 5 either way
 
-CHANNEL = {"weight": 0, "width": 1, "height": 2}  # physics: by which each property is observed
-SCATTER_MEDIAN = np.array([1e-3, 1e-3, 0.02])  # prior: share that differs from grip to grip
-# prior: normal prior of log(share / its prior median): of heavier tails no sd would be left
-SCATTER_LOG_SD = 1.0
-COMMON = np.array([5e-4, 1e-3, 0.03])  # prior: standard deviation of the share that all grips have alike
+SCATTER_MEDIAN = np.array([1e-3, 1e-3, 0.02])  # prior: median share that differs between grips, by channel
+SCATTER_LOG_SD = 1.0  # prior: of log(share / its median), normal: heavier tails would have no sd
+COMMON = np.array([5e-4, 1e-3, 0.03])  # prior: sd of the share common to all grips, by channel
 
 
 def property_priors(names: Iterable[tuple[str, str]]) -> tuple[np.ndarray, np.ndarray]:
@@ -33,8 +31,8 @@ def property_priors(names: Iterable[tuple[str, str]]) -> tuple[np.ndarray, np.nd
 def log_prior(prop: str, coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Log density (N,), up to a constant, of values (N,) of sum(coefficients * property of an object).
 
-    A sum of independent log-normal variables is taken as the log-normal of the same first two
-    moments (Fenton 1960), one with differences as the normal. -inf where a positive sum is not.
+    A sum of independent log-normal variables is approximated by the log-normal of the same first two moments
+    (Fenton 1960), one with differences by the normal. -inf for non-positive values of a positive sum.
     """
     of_one = PROPERTY_LOG_SD[prop] ** 2
     each = PROPERTY_MEDIAN[prop] * np.exp(of_one / 2)

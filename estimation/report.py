@@ -1,4 +1,4 @@
-"""Properties in words, numbers and tables, and against what was measured apart from the trials."""
+"""Properties as JSON, text and tables, and compared with values measured apart from the trials."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def summary(draws: np.ndarray, unit: str) -> dict:
 UNITS = decompose.UNITS | {"friction": "1"}
 Actual = dict[str, dict[str, tuple[float, float]]]
 
-# limit: SI units; no hand lifts, spans or slips on what lies beyond
+# limit: SI units; beyond what any hand lifts, spans or slips on
 LIMITS = {"weight": (1e-4, 1e4), "width": (1e-5, 10.0), "height": (1e-5, 10.0), "friction": (1e-4, 1e3)}
 
 
 def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
-    """Properties measured apart from the trials.
+    """Read properties measured apart from the trials.
 
     Args:
         path: a TOML file with tables [OBJECT.PROPERTY] of unit, value and sd.
@@ -46,8 +46,7 @@ def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
         friction.
 
     Raises:
-        InputError: an object that is not among `objects`, an unknown key, a wrong unit or a number that
-            cannot be.
+        InputError: an object that is not among `objects`, an unknown key, a wrong unit, an impossible number.
     """
     return parse_actual(read_toml(path), objects, str(path))
 
@@ -69,7 +68,7 @@ def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "ac
 
 
 def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0) -> dict[str, Any]:
-    """Identified properties compared with measured values.
+    """Compare identified properties with measured values.
 
     Args:
         properties: as in identify's JSON.
@@ -77,10 +76,9 @@ def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0)
         smallest: relative deviation that matters.
 
     Returns:
-        By object and property: `value`, `sd`, and where the property was identified `relative_deviation`, `z`
-        (in sds of both together), `inside_95` and `disagrees`, which is beyond SURE sds and beyond
-        `smallest`. Of a friction with a lower bound alone it can only be said that the measured one lies
-        below.
+        By object and property: `value`, `sd`, and if the property was identified `relative_deviation`, `z`
+        (in sds of both combined), `inside_95` and `disagrees` (beyond SURE sds and beyond `smallest`). A
+        friction with only a lower bound disagrees if the measured value lies below it.
     """
     out: dict[str, Any] = {}
     for obj, entries in measured.items():
@@ -102,7 +100,7 @@ def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0)
 
 
 def disagreements(properties: dict[str, Any], compared: dict[str, Any]) -> list[str]:
-    """A line for each measured value that the recordings contradict."""
+    """One line for each measured value that the recordings contradict."""
     lines = []
     for obj, entries in compared.items():
         for prop, row in entries.items():
@@ -145,8 +143,11 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
 
 
 def property_rows(body: dict[str, Any], measured: Actual | None = None) -> list[dict[str, str]]:
-    """Of every property in words: `estimate`, its intervals, what was `measured`, by how many per cent the
-    estimate is off that, and the subtasks that it is `from`, or why it is unknown."""
+    """One row per property as text: estimate, intervals, measured value, deviation, and its source.
+
+    `deviation`: of the estimate from the measured value in per cent; `from`: the subtasks that determine it,
+    or why it is unknown.
+    """
     rows = []
     for obj, prop, entry in ((o, p, e) for o, own in body["properties"].items() for p, e in own.items()):
         shown, compared = SHOWN[prop], body.get("actual", {}).get(obj, {}).get(prop, {})
@@ -174,7 +175,7 @@ def property_rows(body: dict[str, Any], measured: Actual | None = None) -> list[
 
 
 def properties_table(body: dict[str, Any], measured: Actual | None = None) -> Table:
-    """The properties for people to read, lengths in cm as the paper has them."""
+    """The properties for people to read, lengths in cm as in the paper."""
     keys = ["block", "property", "estimate", "interval_95", *(("measured", "deviation") if measured else ())]
     heads = ["95 % interval" if key == "interval_95" else key for key in keys]
     rows = [[row[key] for key in keys] for row in property_rows(body, measured)]

@@ -1,9 +1,9 @@
-"""emcee on the scales, the unknowns drawn given them: moves, convergence and draws.
+"""Sampling of the scales by emcee, and of the unknowns given them: moves, convergence, draws.
 
-All else is integrated out (`estimation.posterior`), so emcee moves in six dimensions whatever the
-task. Most proposals are independent draws (`Proposal`), the rest differential evolution (ter Braak 2006),
-which frees walkers that it would hold in a tail. benchmarks/moves.py of commit f82105c compares them with
-emcee's stretch move.
+All else is integrated out (`estimation.posterior`), so emcee moves in six dimensions whatever the task. Most
+proposals are independent draws (`Proposal`), the others differential evolution (ter Braak 2006), which frees
+walkers that would be stuck in a tail. benchmarks/moves.py of commit f82105c compares them with emcee's
+stretch move.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from estimation import priors
 from estimation.posterior import NUM_CHANNELS, Mode, Posterior, find_mode
 from hmmseg.tables import Brief
 
-TAIL = 5.0  # numerics: degrees of freedom for the noise: proposals need heavier tails than the posterior
-WIDEN = 1.1  # numerics: of the Laplace covariance, likewise
-# numerics: share of proposals whose scatter is a t about its prior's median, heavier than any posterior
+TAIL = 5.0  # numerics: degrees of freedom of noise proposals, whose tails must exceed the posterior's
+WIDEN = 1.1  # numerics: factor of the Laplace covariance, for the same reason
+# numerics: share of scatter proposals from a t about the prior median, whose tails exceed any posterior's
 FROM_PRIOR = 0.1
 STEP, REACH = 0.25, (-10.0, 10.0)  # numerics: of the grid, in log(share / its prior median)
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """Multivariate t of the noise scales: `mean` (3,), `chol` (3, 3); densities (3, G) of the scatters.
+    """Multivariate t of the noise scales, `mean` (3,) and `chol` (3, 3); grid densities of the scatters.
 
-    `cells` are probabilities of the grid's intervals, of width STEP from REACH[0] on.
+    `cells` (3, G): probabilities of the grid's intervals, of width STEP from REACH[0] on.
     """
 
     mean: np.ndarray
@@ -82,25 +82,25 @@ def _log_student(z2: np.ndarray, tail: float, dim: int) -> np.ndarray:
 
 INDEPENDENT = 0.9  # numerics: share of independence proposals
 WALKERS = 64  # numerics: of emcee
-BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000  # numerics: steps left out, between looks at convergence, at most
+BURN_IN, CHUNK, MAX_STEPS = 25, 100, 2000  # numerics: steps discarded, between convergence checks, at most
 MIN_LENGTH = 50  # cited: steps in units of the autocorrelation time, emcee's own rule
 MIN_ESS, MAX_RHAT = 1000.0, 1.01  # cited: Gelman et al. 2013, and enough for two digits of a quantile
-ENOUGH = 1.5 * MIN_ESS  # to stop at: an estimate of it is itself uncertain
-GROUPS = 4  # numerics: chains that walkers are joined into for R-hat
-KEPT = 4096  # numerics: draws of the unknowns at least, where the chain has so many
-BATCH = 256  # numerics: drawn at once
-MIN_EFFICIENCY = 0.05  # numerics: share of draws that the unknowns' priors must leave effective
+ENOUGH = 1.5 * MIN_ESS  # sample size at which to stop, as its estimate is itself uncertain
+GROUPS = 4  # numerics: chains into which walkers are joined for R-hat
+KEPT = 4096  # numerics: least draws of the unknowns, if the chain has as many
+BATCH = 256  # numerics: draws at once
+MIN_EFFICIENCY = 0.05  # numerics: least effective share of draws after weighting by the unknowns' priors
 
 
 @dataclass(frozen=True, repr=False)
 class Draws(Brief):
     """Posterior draws of the scales (walkers, steps, 6) and unknowns (walkers, steps, Q) [N, m].
 
-    `ess`: smallest effective sample size over scales (emcee's autocorrelation time), `rhat`: largest
-    split R-hat over scales, walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 6):
-    of model error that all grips have alike; `deviations` (walkers, steps, N) of the hand.
-    `prior_ess`: share of draws left effective by the
-    unknowns' priors. `impossible`: unknowns whose every draw has a sign that no such property has.
+    `ess`: smallest effective sample size over scales (emcee's autocorrelation time); `rhat`: largest split
+    R-hat over scales, with walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 6): model error
+    common to all grips; `deviations` (walkers, steps, N) of the hand. `prior_ess`: effective share of draws
+    after weighting by the unknowns' priors. `impossible`: unknowns all of whose draws have an impossible
+    sign.
     """
 
     scales: np.ndarray
@@ -121,7 +121,7 @@ class Draws(Brief):
 
     @property
     def shortfall(self) -> str:
-        """The first criterion of convergence that fails, with its number; empty where none does."""
+        """The first convergence criterion that fails, with its number; empty if none does."""
         if self.ess < MIN_ESS:
             return f"effective sample size of {self.ess:.0f}; {MIN_ESS:.0f} are needed"
         if self.rhat > MAX_RHAT:
@@ -133,14 +133,14 @@ class Draws(Brief):
 
     @property
     def converged(self) -> bool:
-        """Whether all criteria are met, priors taken in."""
+        """Whether all criteria are met, priors included."""
         return not self.shortfall
 
 
 def sample(
     post: Posterior, seed: int, progress: Callable[[int, int], None] | None = None, mode: Mode | None = None
 ) -> Draws:
-    """Draws from the posterior, until converged or MAX_STEPS; `progress(steps, of)` is called."""
+    """Draw from the posterior until converged or MAX_STEPS; `progress(steps, of)` is called meanwhile."""
     import emcee  # slow to import: it loads scipy.stats
 
     mode = find_mode(post) if mode is None else mode
@@ -183,12 +183,11 @@ def sample(
 def draw_unknowns(
     post: Posterior, theta: np.ndarray, random: np.random.RandomState
 ) -> tuple[np.ndarray, float, tuple[int, ...]]:
-    """Draws (W, Q + N + 6) of unknowns, deviations and common shares, one for each row of scales.
+    """Draws (W, Q + N + 6) of unknowns, deviations and common shares, one per row of scales.
 
-    They come from the conditional Gaussian, whose prior of the unknowns is flat, and are resampled
-    by the unknowns' own prior (systematically, so order is kept). Also the share of draws that this
-    leaves effective (next to 1 where the recording decides), and the unknowns of whose draws the prior allows
-    none: these stay as the recording has them.
+    Drawn from the conditional Gaussian, with a flat prior of the unknowns, and resampled by the unknowns' own
+    prior (systematically, so order is kept). Also returns the effective share of draws after that (close to 1
+    if the recording decides), and the unknowns all of whose draws the prior excludes, which keep their draws.
     """
     parts = []
     for k in range(0, len(theta), BATCH):
@@ -220,7 +219,7 @@ def _resampled(weight: np.ndarray, random: np.random.RandomState) -> np.ndarray:
 def effective_sample_size(chain: np.ndarray) -> float:
     """Smallest effective sample size over parameters of a chain (walkers, steps, dim).
 
-    By emcee's autocorrelation time (Goodman & Weare 2010); 0 where a parameter never moved.
+    By emcee's autocorrelation time (Goodman & Weare 2010); 0 if a parameter never moved.
     """
     import emcee  # slow to import: it loads scipy.stats
 
@@ -233,9 +232,9 @@ def effective_sample_size(chain: np.ndarray) -> float:
 def split_rhat(chain: np.ndarray) -> float:
     """Largest split R-hat over parameters of a chain (walkers, steps, dim).
 
-    Walkers are joined into GROUPS chains (a walker alone is too short to have a variance of its
-    own), each halved in time: Gelman et al. 2013, Bayesian Data Analysis, section 11.4. Walkers of
-    an ensemble are not independent, so this checks for drift and stuck groups, no more.
+    Walkers are joined into GROUPS chains (one walker alone is too short to have a variance of its own), each
+    halved in time: Gelman et al. 2013, Bayesian Data Analysis, section 11.4. Walkers of an ensemble are not
+    independent, so this only detects drift and stuck groups.
     """
     walkers, steps, dim = chain.shape
     half, per_group = steps // 2, walkers // GROUPS

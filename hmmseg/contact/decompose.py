@@ -1,17 +1,17 @@
-"""Task decomposition: from objects and moves to subtasks and the properties each can reveal.
+"""Task decomposition: from objects and moves to subtasks, and the properties each can reveal.
 
-A task is cut at each anticipated change of the active constraint set, whose constraints are those of the
-hand and of the object it manipulates: finger on object, object on its support. Each contact state gives
-quasistatic equations between measured signals and unknowns (planar statics of a rigid block between two
-fingertips). A property is determined when some combination of the equations of a subtask, alone or with
-another of the same move, leaves it as the only unknown, which exact elimination finds without tolerances.
-What no pair determines is sought in all moves together, as the heights in a tower of three are.
+A task is divided at each expected change of the active constraint set: the contacts of the fingers with the
+manipulated object, and of the object with its support. Each contact state gives quasistatic equations between
+measured signals and unknowns (planar statics of a rigid block between two fingertips). A property is
+determined if some combination of the equations of one subtask, or of two of the same move, isolates it as the
+only unknown, which exact elimination finds without tolerances. Properties that no pair determines are sought
+in all moves together, such as the heights in a tower of three.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, TypeVar
@@ -27,36 +27,45 @@ FINGERS = ("finger1", "finger2")
 
 
 @dataclass(frozen=True)
-class ContactState:
-    """The constraints of the hand and the object that it manipulates, between two changes of them.
+class Subtask:
+    """One step of a task, between two changes of the active constraints of the hand and its object.
 
-    `name`: the state's; the paper calls every support the ground. `support`: what the held object touches
-    besides the fingers, None while free or lifted. `beneath`: objects from its support down to the ground.
-    `move`: 0-based index of the move.
+    `state`: the contact state; the paper calls every support the ground. `move`: 0-based index in
+    `task.performed` of its move (None in a plain ordered task); a pregrasp belongs to the first move, a
+    release to the move it ends. `support`: what the held object touches besides the fingers, None while free
+    or lifted; `beneath`: objects from the support down to the ground.
     """
 
-    object: str
+    index: int
     name: str
-    support: str | None
-    beneath: tuple[str, ...]
-    move: int
+    object: str | None
+    state: str
+    move: int | None
+    support: str | None = None
+    beneath: tuple[str, ...] = ()
 
     @property
-    def held(self) -> bool:
-        """Whether the fingers are on the object."""
-        return self.name != FREE
+    def label(self) -> str:
+        """Its name in the interface, such as `carry block1`."""
+        return labelled(self.name, self.object)
 
     @property
     def constraints(self) -> tuple[str, ...]:
-        """The active contacts of the hand and the held object."""
-        fingers = [f"{finger}-{self.object}" for finger in FINGERS if self.held]
-        slips = " (slipping)" if self.name == SLIDING else ""
+        """The active contacts of the hand and the held object; none in a plain ordered task."""
+        if self.state == FREE or self.object is None:
+            return ()
+        slips = " (slipping)" if self.state == SLIDING else ""
         standing = [] if self.support is None else [f"{self.object}-{self.support}{slips}"]
-        return tuple(sorted(fingers + standing))
+        return tuple(sorted([*(f"{finger}-{self.object}" for finger in FINGERS), *standing]))
+
+
+def labelled(subtask: str, obj: str | None) -> str:
+    """A subtask with its object, such as `carry block1`; only its name if it has none."""
+    return subtask if obj is None else f"{subtask} {obj}"
 
 
 def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
-    """Objects from what `name` stands on down to the ground, nearest first."""
+    """Objects from the support of `name` down to the ground, nearest first."""
     beneath, below = [], support[name]
     while below != GROUND:
         beneath.append(below)
@@ -64,24 +73,26 @@ def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
     return tuple(beneath)
 
 
-def contact_states(task: BlockTask) -> Iterator[ContactState]:
-    """The task's contact states in order, one between every two changes of the constraint set.
+def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
+    """The ordered subtasks of a task.
 
-    The hand closes on the object, breaks or slips its support contact, restores one at the
-    destination, and opens.
+    In every move of blocks the hand closes on the object, breaks its support contact or slides it, restores
+    contact at the destination, and opens.
     """
+    if isinstance(task, SequenceTask):
+        return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
     support = dict(task.initial)
-    yield ContactState(task.performed[0].object, FREE, None, (), 0)
+    steps = [Subtask(0, "pregrasp", task.performed[0].object, FREE, 0)]
     for index, move in enumerate(task.performed):
-        obj, beneath = move.object, stack(support, move.object)
-        yield ContactState(obj, ON_GROUND, support[obj], beneath, index)
-        if move.slide:
-            yield ContactState(obj, SLIDING, support[obj], beneath, index)
-        else:
-            yield ContactState(obj, ABOVE_GROUND, None, (), index)
+        obj = move.object
+        lifted, before = (None, ()), (support[obj], stack(support, obj))
         support[obj] = move.to
-        yield ContactState(obj, ON_GROUND, move.to, stack(support, obj), index)
-        yield ContactState(obj, FREE, None, (), index)
+        after = (move.to, stack(support, obj))
+        moved = ("slide", SLIDING, before) if move.slide else ("carry", ABOVE_GROUND, lifted)
+        grip = (("pickup", ON_GROUND, before), moved, ("place", ON_GROUND, after), ("release", FREE, lifted))
+        for name, state, (on, beneath) in grip:
+            steps.append(Subtask(len(steps), name, obj, state, index, on, beneath))
+    return tuple(steps)
 
 
 WEIGHT, WIDTH, HEIGHT, FRICTION = "weight", "width", "height", "friction"
@@ -97,7 +108,7 @@ PROPERTIES = tuple(UNITS)
 
 @dataclass(frozen=True)
 class Source:
-    """A signal measured during a subtask (its index); `sample` counts the loads it was read at."""
+    """A signal measured during a subtask (its index); `sample` numbers the loads at which it was read."""
 
     subtask: int
     signal: str
@@ -110,7 +121,7 @@ Equation = Row[Unknown | Source]
 
 
 def reduced(rows: Iterable[Row[Key]], lead: Callable[[Row[Key]], Key | None]) -> dict[Key, Row[Key]]:
-    """Rows of the reduced row echelon form by their pivots, which `lead` chooses (None: a row has none)."""
+    """Rows of the reduced row echelon form by pivot, which `lead` chooses (None: no pivot in this row)."""
     pivots: dict[Key, Row[Key]] = {}
     for row in rows:
         for key in [key for key in row if key in pivots]:
@@ -134,47 +145,47 @@ def is_property(unknown: Unknown) -> bool:
     return unknown[0] in PROPERTIES or unknown[0].startswith(FRICTION_ON)
 
 
-def balance(index: int, state: ContactState, loads: int = 1) -> list[Equation]:
-    """Quasistatic equations of subtask `index`, at `loads` different vertical forces.
+def balance(step: Subtask, loads: int = 1) -> list[Equation]:
+    """Quasistatic equations of a subtask, at `loads` different vertical forces.
 
-    Geometry: the fingers' distance is the width; each finger is as high as the object's bottom
-    plus where it grips, which stays the same throughout one move. Forces: the fingers' net
-    vertical force is the weight less the support's load, their net horizontal force is the
-    support's push. Slipping: push = friction x load (Coulomb), linearised about given loads;
-    their values are arbitrary, distinct numbers, as only rank matters.
+    Geometry: the fingers' distance is the width; the height of each finger is that of the object's bottom
+    plus that of the grip on it, which is constant throughout one move. Forces: the fingers' net vertical
+    force is the weight less the support's load, their net horizontal force is the support's push. Slipping:
+    push = friction x load (Coulomb), linearised about given loads; their values are arbitrary, distinct
+    numbers, as only rank matters.
     """
-    if not state.held:
+    if step.state == FREE or step.object is None:
         return []
-    name, grasp = state.object, str(state.move)
-    bottom: list[Unknown] = [(HEIGHT, below) for below in state.beneath]
-    if state.support is None:
+    index, name, grasp = step.index, step.object, str(step.move)
+    bottom: list[Unknown] = [(HEIGHT, below) for below in step.beneath]
+    if step.support is None:
         bottom = [("lift", str(index))]
     equations = [_equation({(WIDTH, name): 1}, Source(index, X_POSITIONS))]
     for finger in FINGERS:
         held = dict.fromkeys([*bottom, ("grip", finger, grasp)], 1)
         equations.append(_equation(held, Source(index, Y_POSITIONS)))
-    if state.support is None:
+    if step.support is None:
         return [*equations, _equation({(WEIGHT, name): 1}, Source(index, Y_FORCES))]
     for sample in range(loads):
         load, push = ("load", str(index), str(sample)), ("push", str(index), str(sample))
         equations.append(_equation({(WEIGHT, name): 1, load: -1}, Source(index, Y_FORCES, sample)))
         equations.append(_equation({push: 1}, Source(index, X_FORCES, sample)))
-        if state.name == SLIDING:
-            friction = (FRICTION_ON + state.support, name)
+        if step.state == SLIDING:
+            friction = (FRICTION_ON + step.support, name)
             equations.append({push: Fraction(1), load: Fraction(-1, 3), friction: Fraction(-sample - 2)})
     return equations
 
 
 def _equation(unknowns: Mapping[Unknown, int], measured: Source) -> Equation:
-    """That the unknowns, with these coefficients, sum to what is measured."""
+    """The equation that the unknowns, with these coefficients, sum to the measured signal."""
     return {key: Fraction(value) for key, value in unknowns.items()} | {measured: Fraction(-1)}
 
 
 def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> dict[Unknown, Row[Source]]:
     """Unknowns that the equations determine, each as a combination of sources.
 
-    An unknown is in the row space on its own exactly when its pivot row holds no other. `known` unknowns are
-    taken as given.
+    An unknown is in the row space on its own exactly if its pivot row contains no other. `known` unknowns are
+    given.
     """
 
     def unknown(row: Equation) -> list[Unknown]:
@@ -183,49 +194,19 @@ def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> 
     def lead(row: Equation) -> Unknown | None:
         return min(unknown(row), key=is_property, default=None)  # nuisances go first
 
-    given = set(known)
-    rows = ({key: value for key, value in row.items() if key not in given} for row in equations)
+    excluded = set(known)
+    rows = ({key: value for key, value in row.items() if key not in excluded} for row in equations)
     return {pivot: {key: -value for key, value in row.items() if isinstance(key, Source)}
             for pivot, row in reduced(rows, lead).items()
             if len(unknown(row)) == 1 and not isinstance(pivot, Source)}  # fmt: skip
 
 
-def labelled(subtask: str, obj: str | None) -> str:
-    """A subtask with its object, as `carry block1`; by its name alone where it has none."""
-    return subtask if obj is None else f"{subtask} {obj}"
-
-
-@dataclass(frozen=True)
-class Subtask:
-    """One step of a task: its name, contact state and manipulated object.
-
-    `move` is the 0-based index in `task.performed` of the move it belongs to (None in a plain
-    ordered task); a pregrasp belongs to the first move, a release to the move it ends. `support`
-    is what the held object touches besides the fingers, None while free or lifted; `constraints`
-    are the active contacts of the hand and the held object.
-    """
-
-    index: int
-    name: str
-    object: str | None
-    state: str
-    move: int | None
-    support: str | None = None
-    constraints: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """As the interface names it, as `carry block1`."""
-        return labelled(self.name, self.object)
-
-
 @dataclass(frozen=True)
 class Evidence:
-    """One way to learn a property: the signals of the subtasks that are needed together.
+    """One way to learn a property: the signals of the subtasks required together.
 
-    `bound`: it gives a lower bound only (a friction coefficient without slip). `given` are
-    properties, determined elsewhere, that it takes as known. `condition`, where not None, says
-    what the recording must show besides.
+    `bound`: only a lower bound (a friction coefficient without slip). `given`: properties, determined
+    elsewhere, that are required. `condition`: what the recording must show in addition, if anything.
     """
 
     sources: tuple[Source, ...]
@@ -235,11 +216,11 @@ class Evidence:
 
     @property
     def subtasks(self) -> tuple[int, ...]:
-        """Indices of the subtasks needed, in order."""
+        """Indices of the required subtasks, in order."""
         return tuple(sorted({source.subtask for source in self.sources}))
 
     def signals(self, subtask: int | None = None) -> tuple[str, ...]:
-        """Names of the signals needed, of one subtask or of all."""
+        """Names of the required signals, of one subtask or of all."""
         wanted = (s.signal for s in self.sources if subtask in (None, s.subtask))
         return tuple(sorted(set(wanted)))
 
@@ -248,8 +229,8 @@ class Evidence:
 class Property:
     """A property of an object: every way to learn it, or the reason why there is none.
 
-    Any one of `evidence` is enough by itself, the strongest first. `name` is weight, width, height,
-    friction (of the fingers on the object) or friction_on_SUPPORT.
+    Each of `evidence` suffices by itself, the strongest first. `name` is weight, width, height, friction (of
+    the fingers on the object) or friction_on_SUPPORT.
     """
 
     object: str
@@ -259,7 +240,7 @@ class Property:
 
     @property
     def kind(self) -> str | None:
-        """ "value", "bound" where only a lower bound can be had, None where nothing can."""
+        """ "value", "bound" if only a lower bound is available, None if nothing is."""
         if not self.evidence:
             return None
         return "bound" if all(evidence.bound for evidence in self.evidence) else "value"
@@ -267,7 +248,7 @@ class Property:
 
 @dataclass(frozen=True, repr=False)
 class Decomposition(Tabled):
-    """A task's subtasks in order, and for each object's properties what reveals them."""
+    """A task's subtasks in order, and for each object the evidence for its properties."""
 
     task: AnyTask
     subtasks: tuple[Subtask, ...]
@@ -275,20 +256,20 @@ class Decomposition(Tabled):
     notes: tuple[str, ...] = ()
 
     def reveals(self, index: int) -> list[tuple[Property, Evidence]]:
-        """All that subtask `index` helps to reveal, by its first evidence for each property."""
-        found = []
+        """Properties that subtask `index` helps to reveal, each with its first such evidence."""
+        pairs = []
         for entry in (entry for entries in self.properties.values() for entry in entries.values()):
             evidence = next((e for e in entry.evidence if index in e.subtasks), None)
             if evidence is not None:
-                found.append((entry, evidence))
+                pairs.append((entry, evidence))
         order = (WEIGHT, WIDTH, HEIGHT, FRICTION)  # friction on a support comes last
-        return sorted(found, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
+        return sorted(pairs, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
 
     def in_paper(self, index: int, entry: Property) -> bool:
         """Whether the paper's Table 1 would list the property for this subtask.
 
-        It reads weight and width only while an object is held above the ground, and speaks of
-        friction with a support only in sliding contact (its Sections 2.1 and 3.2).
+        It reads weight and width only while an object is held above the ground, and mentions friction with a
+        support only in sliding contact (its Sections 2.1 and 3.2).
         """
         state = self.subtasks[index].state
         if entry.name in (WEIGHT, WIDTH):
@@ -321,22 +302,8 @@ class Decomposition(Tabled):
 VARYING_LOAD = "the vertical force must vary while the object slides"
 
 
-def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
-    """The ordered subtasks of a task."""
-    if isinstance(task, SequenceTask):
-        return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
-    named, held = [], False
-    for i, state in enumerate(contact_states(task)):
-        names = {FREE: "release" if i else "pregrasp", ON_GROUND: "place" if held else "pickup",
-                 SLIDING: "slide", ABOVE_GROUND: "carry"}  # fmt: skip
-        named.append(Subtask(i, names[state.name], state.object, state.name, state.move, state.support,
-                             state.constraints))  # fmt: skip
-        held = state.held
-    return tuple(named)
-
-
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
-    """For each performed move, how far its object's bottom rises, as a sum of object heights.
+    """For each performed move, the rise of its object's bottom as a sum of object heights.
 
     The paper's height of the block beneath (its Table 3) is the case of a single coefficient.
 
@@ -344,25 +311,23 @@ def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
         task: of blocks.
 
     Returns:
-        (0-based index of the move, {object: coefficient}) a move: bottom height at place minus bottom
-        height at pickup. A slide rises by nothing: {}.
+        (0-based index of the move, {object: coefficient}) per move: bottom height at place less that
+        at pickup. The rise of a slide is {}.
     """
-    states = list(contact_states(task))
-    equations = []
-    for index in range(len(task.performed)):
-        start, _, end = (state for state in states if state.held and state.move == index)
+    held, equations = [step for step in subtasks(task) if step.state != FREE], []
+    for move, (start, end) in enumerate(zip(held[::3], held[2::3], strict=True)):
         rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}
-        equations.append((index, {name: value for name, value in rise.items() if value}))
+        equations.append((move, {name: value for name, value in rise.items() if value}))
     return equations
 
 
 def decompose(task: AnyTask) -> Decomposition:
-    """Subtasks of a task and what each object's properties can be learned from."""
+    """Subtasks of a task, and how each object's properties can be learned."""
     if isinstance(task, SequenceTask):
         note = "a plain ordered task has no block physics: no properties"
         return Decomposition(task, subtasks(task), notes=(note,))
-    states = list(contact_states(task))
-    learned = _learn(states)
+    steps = subtasks(task)
+    learned = _learn(steps)
     properties: dict[str, dict[str, Property]] = {}
     for name in task.objects:
         rubbed = [key for key, owner in learned if owner == name and key.startswith(FRICTION_ON)]
@@ -370,74 +335,69 @@ def decompose(task: AnyTask) -> Decomposition:
         for key in (*PROPERTIES, FRICTION, *sorted(set(rubbed))):
             ways = learned.get((key, name), ())
             evidence = tuple(sorted(ways, key=lambda e: (e.bound, e.condition is not None, e.subtasks)))
-            reason = None if evidence else _reason(task, states, name, key)
+            reason = None if evidence else _reason(task, steps, name, key)
             properties[name][key] = Property(name, key, evidence, reason)
     notes = ()
     if task.repeat == "unknown":
         notes = ("the moves repeat as often as the recording shows; one round is decomposed",)
-    return Decomposition(task, subtasks(task), properties, notes)
+    return Decomposition(task, steps, properties, notes)
 
 
-def _learn(states: list[ContactState]) -> dict[Unknown, list[Evidence]]:
-    """Every way to learn each property, from the contact states in order."""
+def _learn(steps: Sequence[Subtask]) -> dict[Unknown, list[Evidence]]:
+    """Every way to learn each property."""
     learned: dict[Unknown, list[Evidence]] = {}
-    moves: dict[object, list[list[int]]] = {}  # moves alike in all contacts determine alike
-    for _, group in itertools.groupby((i for i, s in enumerate(states) if s.held), lambda i: states[i].move):
-        indices = list(group)
-        moves.setdefault(tuple((states[i].constraints, states[i].beneath) for i in indices), []).append(
-            indices
-        )
+    moves: dict[object, list[list[Subtask]]] = {}  # moves with equal contacts determine equal properties
+    for _, group in itertools.groupby((s for s in steps if s.state != FREE), lambda s: s.move):
+        move = list(group)
+        moves.setdefault(tuple((s.constraints, s.beneath) for s in move), []).append(move)
     for alike in moves.values():
-        _learn_within(states, alike, learned)
-    equations = [e for alike in moves.values() for i in alike[0] for e in balance(i, states[i])]
+        _learn_within(alike, learned)
+    equations = [e for alike in moves.values() for s in alike[0] for e in balance(s)]
     for unknown, row in determined(equations).items():
         if unknown[0] in PROPERTIES:
             learned.setdefault(unknown, [_evidence(row)])
-    for alike in moves.values():
-        for indices in alike:
-            for index in indices:
-                _learn_friction(index, states[index], learned)
+    for step in itertools.chain.from_iterable(itertools.chain.from_iterable(moves.values())):
+        _learn_friction(step, learned)
     return learned
 
 
-def _learn_within(states: list[ContactState], alike: list[list[int]],
-                  learned: dict[Unknown, list[Evidence]]) -> None:  # fmt: skip
-    """What one subtask of a move determines alone, and what only two of them do together."""
+def _learn_within(alike: list[list[Subtask]], learned: dict[Unknown, list[Evidence]]) -> None:
+    """What single subtasks of moves with equal contacts determine, and what only pairs of them do."""
     first, alone = alike[0], set()
     for size in (1, 2):
         for subset in itertools.combinations(first, size):
-            rows = determined(e for i in subset for e in balance(i, states[i]))
+            rows = determined(e for s in subset for e in balance(s))
             for unknown in filter(is_property, rows):
                 if size == 1:
                     alone.add(unknown)
                 elif unknown in alone:
                     continue
-                for indices in alike:
-                    moved = dict(zip(first, indices, strict=True))
+                for move in alike:
+                    moved = {a.index: b.index for a, b in zip(first, move, strict=True)}
                     learned.setdefault(unknown, []).append(_evidence(rows[unknown], moved))
 
 
-def _learn_friction(index: int, state: ContactState, learned: dict[Unknown, list[Evidence]]) -> None:
-    """Coefficients of the contacts of one state: known where the contact's forces are known.
+def _learn_friction(step: Subtask, learned: dict[Unknown, list[Evidence]]) -> None:
+    """Friction at the contacts of one subtask, determined where the contact forces are known.
 
-    A fingertip's forces are measured; a support's follow from the balance once the weight is
-    given. Slip determines the coefficient, sticking bounds it from below.
+    A fingertip's forces are measured; a support's follow from the balance once the weight is given. Slip
+    determines the coefficient, sticking bounds it from below.
     """
-    forces = (Source(index, X_FORCES), Source(index, Y_FORCES))
-    learned.setdefault((FRICTION, state.object), []).append(Evidence(forces, bound=True))
-    if state.support is None:
+    forces, name = (Source(step.index, X_FORCES), Source(step.index, Y_FORCES)), str(step.object)
+    learned.setdefault((FRICTION, name), []).append(Evidence(forces, bound=True))
+    if step.support is None:
         return
-    friction = (FRICTION_ON + state.support, state.object)
-    target = friction if state.name == SLIDING else ("load", str(index), "0")
-    equations = balance(index, state)
+    friction = (FRICTION_ON + step.support, name)
+    target = friction if step.state == SLIDING else ("load", str(step.index), "0")
+    equations = balance(step)
     unknowns = {key for equation in equations for key in equation if not isinstance(key, Source)}
-    known = {key for key in unknowns if any(way.condition is None for way in learned.get(key, ()))}
-    known -= {friction}
-    if target in determined(equations, known):
-        given = tuple(u for u in known if target not in determined(equations, known - {u}))
-        learned.setdefault(friction, []).append(Evidence(forces, state.name != SLIDING, given))
+    given = {key for key in unknowns if any(way.condition is None for way in learned.get(key, ()))}
+    given -= {friction}
+    if target in determined(equations, given):
+        needed = tuple(u for u in given if target not in determined(equations, given - {u}))
+        learned.setdefault(friction, []).append(Evidence(forces, step.state != SLIDING, needed))
         return
-    for unknown, row in determined(balance(index, state, loads=3), known).items():
+    for unknown, row in determined(balance(step, loads=3), given).items():
         if is_property(unknown):
             learned.setdefault(unknown, []).append(_evidence(row, condition=VARYING_LOAD))
 
@@ -449,7 +409,7 @@ def _evidence(
     return Evidence(tuple(Source(*source) for source in sorted(used)), condition=condition)
 
 
-def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str) -> str:
+def _reason(task: BlockTask, steps: Iterable[Subtask], name: str, key: str) -> str:
     """Why nothing reveals a property, in plain words."""
     if key == HEIGHT:
         rises = {str(i + 1): rise for i, rise in height_equations(task) if name in rise}
@@ -458,6 +418,6 @@ def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str
         move, rise = next(iter(rises.items()))
         others = ", ".join(sorted(set(rise) - {name}))
         return f"move {move} changes heights by {name}'s only together with the height of {others}"
-    if not any(state.held and state.object == name for state in states):
+    if not any(step.state != FREE and step.object == name for step in steps):
         return f"no recorded move grips {name}"
     return f"no recorded move lifts {name} clear of its support"

@@ -1,28 +1,25 @@
 """The contact equations of a two-finger grip.
 
-Emissions, observations of properties and residuals of the gap are built from these. The inertia of a
-carried block alone is written again, where it is compiled: in `simgap.gap.residuals`.
-
-Quasistatic balance of the block and linear pads, per sample (x right, y up, finger 1 left; F what a
-fingertip exerts; paper, Sections 2 and 3.3, with the block's inertia and the pads' compliance, which it
-leaves out):
+Quasistatic balance of the block and linear pads, per sample (x right, y up, finger 1 left; F: force exerted
+by a fingertip; paper, Sections 2 and 3.3, extended by the block's inertia and the pads' compliance):
 
 | contact state | equations |
 |---|---|
 | free motion | F1 = F2 = 0 |
-| every grip | `block_width` = w, `block_offset` constant; `block_x`, `block_y`: where the block is |
+| every grip | `block_width` = w, `block_offset` constant; `block_x`, `block_y`: position of the block |
 | hold on ground | `block_x`, `block_y` constant; 0 <= `support_load` |
 | sliding on ground | `block_y` constant; |net fx - m ax| <= mu `support_load` |
 | hold above ground | net fx = m ax; net fy = `carried_force` |
 
-A hand that rolls turns its fingers and what they hold together. These equations hold along and across the
-hand, so differences between the fingers are turned back first (`turned`); sums and means stay as they are:
-weight hangs down however the hand is turned. A roll shows as a height difference of the fingers
+A hand that rolls rotates its fingers together with the held block. These equations hold along and across the
+hand, so differences between the fingers are rotated back first (`turned`); sums and means remain as they are,
+as weight points down however the hand is rotated. A roll shows as a height difference of the fingers
 (`rolled_offset`).
 
 Emissions (hmmseg.segmentation), observations of properties (estimation) and residuals of the gap (simgap) are
-built from these functions; the dynamics of the virtual model (simgap.world) is tested against them. All
-work on NumPy and JAX arrays alike, of any shape that broadcasts, in SI units, and raise nothing.
+built from these functions; the dynamics of the virtual model (simgap.world) is tested against them. The
+inertia of a carried block alone is written again, where it is compiled: in `simgap.gap.residuals`. All
+functions accept NumPy and JAX arrays of any broadcastable shapes, in SI units, and raise nothing.
 """
 
 from __future__ import annotations
@@ -46,23 +43,23 @@ class Pads(NamedTuple):
 
 
 def pads_of(rig: Rig) -> Pads:
-    """The nominal pads of a rig, alike on both fingers."""
+    """The nominal pads of a rig, the same on both fingers."""
     normal, shear = 1 / rig.fingertip.normal_stiffness, 1 / rig.fingertip.shear_stiffness
     return Pads(normal, normal, shear, shear)
 
 
 def block_width(distance: Values, fx1: Values, fx2: Values, pads: Pads) -> Values:
-    """Width of the held block [m]: the fingers' distance and what both pads give under the grip."""
+    """Width of the held block [m]: the fingers' distance plus the give of both pads under the grip."""
     return distance + fx1 * pads.normal1 - fx2 * pads.normal2
 
 
 def block_x(x: Values, fx1: Values, fx2: Values, pads: Pads) -> Values:
-    """Horizontal position of the held block [m] from the fingers' mean position."""
+    """Horizontal position of the held block [m], from the fingers' mean position."""
     return x - (fx1 * pads.normal1 + fx2 * pads.normal2) / 2
 
 
 def block_y(y: Values, fy1: Values, fy2: Values, pads: Pads) -> Values:
-    """Height of the held block [m], up to where it was gripped, from the fingers' mean height."""
+    """Height of the held block [m], up to where it is gripped, from the fingers' mean height."""
     return y - (fy1 * pads.shear1 + fy2 * pads.shear2) / 2
 
 
@@ -72,23 +69,23 @@ def block_offset(offset: Values, fy1: Values, fy2: Values, pads: Pads) -> Values
 
 
 def turned(across: Values, up: Values, angle: Values) -> tuple[Values, Values]:
-    """A vector with these horizontal and vertical components, turned counterclockwise by `angle` [rad]."""
+    """A vector with these horizontal and vertical components, rotated counterclockwise by `angle` [rad]."""
     cos, sin = np.cos(angle), np.sin(angle)
     return across * cos - up * sin, across * sin + up * cos
 
 
 def rolled_offset(distance: Values, roll: Values) -> Values:
-    """Height difference [m] that a small roll [rad] gives to fingers at this distance [m]."""
+    """Height difference [m] of fingers at this distance [m] due to a small roll [rad]."""
     return distance * roll
 
 
 def hanging(weight: Values, pads: Pads) -> Values:
-    """How far the pads' shear lets a block of this weight hang below the fingers [m]."""
+    """Distance by which a block of this weight hangs below the fingers, by the pads' shear [m]."""
     return weight * (pads.shear1 + pads.shear2) / 4
 
 
 def inertia_factor(acceleration: Values, gravity: float) -> Values:
-    """1 + a / g: the vertical force on a lifted block in units of its weight."""
+    """1 + a / g: vertical force on a lifted block in units of its weight."""
     return 1 + acceleration / gravity
 
 
@@ -98,5 +95,5 @@ def carried_force(weight: Values, ay: Values, gravity: float) -> Values:
 
 
 def support_load(weight: Values, fy: Values) -> Values:
-    """What the support carries of a block at rest on it [N]; a support only pushes."""
+    """Load of a resting block on its support [N], which can only push."""
     return weight - fy

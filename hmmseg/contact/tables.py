@@ -1,4 +1,4 @@
-"""A decomposition as a table, as the document of `decompose`, and as the paper prints it (Table 1)."""
+"""A decomposition as a table, as the JSON document of `decompose`, and in the paper's notation (Table 1)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hmmseg.io.task import BlockTask
 
 
 def cell(found: Decomposition, index: int, entry: Property, evidence: Evidence) -> str:
-    """Signals that subtask `index` gives towards a property; in parentheses what goes beyond the paper."""
+    """Signals of subtask `index` that reveal a property; parentheses mark what goes beyond the paper."""
     partners = [str(other + 1) for other in evidence.subtasks if other != index]
     signals = " and ".join(evidence.signals(index)).replace("horizontal forces and", "horizontal and")
     text = (">= " if evidence.bound else "") + signals
@@ -37,7 +37,7 @@ def cell(found: Decomposition, index: int, entry: Property, evidence: Evidence) 
 
 
 def equation(found: Decomposition) -> str:
-    """The decomposition as the paper's equation 1 writes it: subtask = (state, {properties})."""
+    """The decomposition in the notation of the paper's equation 1: subtask = (state, {properties})."""
     label = _labels(found)
     parts = []
     for subtask in found.subtasks:
@@ -56,7 +56,7 @@ def equation(found: Decomposition) -> str:
 
 
 def _labels(found: Decomposition) -> dict[str, str]:
-    """Objects by their number alone where all are named alike (block1: 1), else by name."""
+    """Objects by number if their names differ only by it (block1: 1), otherwise by name."""
     numbered = {name: re.fullmatch(r"(.*?)(\d+)", name) for name in found.properties}
     if len({match[1] for match in numbered.values() if match}) == 1 and all(numbered.values()):
         return {name: match[2] for name, match in numbered.items() if match}
@@ -64,7 +64,7 @@ def _labels(found: Decomposition) -> dict[str, str]:
 
 
 def decomposition_table(found: Decomposition) -> Table:
-    """The paper's Table 1; in parentheses what the balance gives beyond it."""
+    """The paper's Table 1; in parentheses, what the balance gives beyond it."""
     columns = [WEIGHT, WIDTH, HEIGHT, FRICTION]
     if any(name.startswith(FRICTION_ON) for entries in found.properties.values() for name in entries):
         columns.append(FRICTION_ON)

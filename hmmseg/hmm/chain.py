@@ -1,9 +1,9 @@
-"""A chain of states in a known order: what it may do from one sample to the next, checked once."""
+"""A chain of states in a known order: its weights, and why it may be infeasible."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import jax
 import numpy as np
@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 
 
 class InfeasibleAlignment(ValueError):
-    """No path through the subtasks has any probability.
+    """No path through the subtasks has positive probability.
 
-    `subtask` (0-based) is the one that starves: the first that no path reaches, or the last one
-    where it is reached but cannot be held to the end.
+    `subtask` (0-based) is at fault: the first one that no path reaches, or the last one if it is reached but
+    cannot be held to the end.
     """
 
     def __init__(self, subtask: int, reason: str) -> None:
@@ -25,26 +25,45 @@ class InfeasibleAlignment(ValueError):
         self.reason = reason
 
 
-@register_pytree_node_class
-class Chain:
-    """Log weights of a left-to-right chain of `num_states` states; need not be normalised.
+class Leaves:
+    """Base of pytrees whose children are the attributes named in `leaves`."""
 
-    A pytree: it may be an argument of functions under jit, vmap and grad, its weights be traced.
+    leaves: ClassVar[tuple[str, ...]]
+
+    def __init_subclass__(cls) -> None:
+        register_pytree_node_class(cls)
+
+    def tree_flatten(self) -> tuple[tuple, None]:
+        """The leaves, for JAX."""
+        return tuple(getattr(self, name) for name in self.leaves), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, leaves: tuple) -> Self:
+        """An instance with these leaves, which may be any JAX values."""
+        tree = object.__new__(cls)
+        vars(tree).update(zip(cls.leaves, leaves, strict=True))
+        return tree
+
+
+class Chain(Leaves):
+    """Log weights of a left-to-right chain of `num_states` states; they need not be normalised.
+
+    A pytree: a chain may be an argument of functions under jit, vmap and grad, with traced weights.
 
     Args:
-        log_stay: (num_states,), to stay in a state from one sample to the next.
-        log_advance: (num_states - 1,), to go from k to k + 1.
-        log_skip: from k to k + 2 (num_states - 2,), or a sequence of arrays for k + 2, k + 3, ...
-        log_initial: (num_states,), of the first sample's state; None: the first state, for sure.
-        log_final: (num_states,), of the last sample's state; None: the last state, for sure.
-            Any of the first three may vary in time and then has a row for each transition,
-            (num_samples - 1, ...), row t between the samples t and t + 1. -inf forbids.
+        log_stay: (num_states,), of staying in a state from one sample to the next.
+        log_advance: (num_states - 1,), of going from k to k + 1.
+        log_skip: of going from k to k + 2 (num_states - 2,), or a sequence of arrays for k + 2, k + 3, ...
+        log_initial: (num_states,), of the first sample's state; None: always the first state.
+        log_final: (num_states,), of the last sample's state; None: always the last state.
+            The first three may vary in time and then have a row per transition, (num_samples - 1, ...), row t
+            between samples t and t + 1. -inf forbids.
 
     Raises:
         ValueError: wrong shapes, NaN or +inf.
     """
 
-    __slots__ = ("bands", "log_final", "log_initial")
+    leaves = ("bands", "log_initial", "log_final")
 
     def __init__(
         self,
@@ -72,28 +91,14 @@ class Chain:
         self.log_initial = end_weights("log_initial", log_initial, first)
         self.log_final = end_weights("log_final", log_final, last)
 
-    def tree_flatten(self) -> tuple[tuple, None]:
-        """The weights, for JAX."""
-        return (self.bands, self.log_initial, self.log_final), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, leaves: tuple) -> Chain:
-        """A chain of weights that are whatever JAX puts in their places."""
-        chain = object.__new__(cls)
-        chain.bands, chain.log_initial, chain.log_final = leaves
-        return chain
-
-    def __reduce__(self) -> tuple:
-        return Chain.tree_unflatten, (None, (self.bands, self.log_initial, self.log_final))
-
     @property
     def num_states(self) -> int:
-        """How many states it has."""
+        """Number of states."""
         return self.bands[0].shape[-1]
 
     @property
     def num_samples(self) -> int | None:
-        """How long recordings must be where weights vary in time, else None."""
+        """Required length of recordings if weights vary in time, else None."""
         return next((len(band) + 1 for band in self.bands if band.ndim == 2), None)
 
     def _check(self, d: int, band: Any) -> None:
@@ -112,7 +117,7 @@ class Chain:
     def by_target(self, xp: Any = np) -> Any:
         """Weights (num_samples - 1 or 1, num_bands, num_states) of coming to k from k - d, -inf for k < d.
 
-        `xp`: NumPy, or jax.numpy where weights may be traced.
+        `xp`: NumPy, or jax.numpy for traced weights.
         """
         bands = [xp.asarray(band).astype(np.float64) for band in self.bands]
         bands = [band[None] if band.ndim == 1 else band for band in bands]
@@ -126,7 +131,7 @@ class Chain:
 
 
 def end_weights(name: str, given: ArrayLike | None, otherwise: np.ndarray) -> Any:
-    """Log weights of the first or last state, `otherwise` where none are given; ValueError for bad ones."""
+    """Log weights of the first or last state, with a default; ValueError for invalid ones."""
     out = otherwise if given is None else _weights(given)
     if out.shape != otherwise.shape:
         raise ValueError(f"{name}: shape {out.shape}, expected {otherwise.shape}")
@@ -135,7 +140,7 @@ def end_weights(name: str, given: ArrayLike | None, otherwise: np.ndarray) -> An
 
 
 def _weights(given: ArrayLike) -> Any:
-    """Doubles of NumPy, or what JAX has as it is."""
+    """NumPy doubles; JAX arrays unchanged."""
     return given if isinstance(given, jax.Array) else np.asarray(given, dtype=np.float64)
 
 
@@ -143,14 +148,20 @@ def _refuse_bad(name: str, weights: Any) -> None:
     if isinstance(weights, Tracer):
         return
     if weights.size and not weights.max() < np.inf:
-        raise ValueError(f"{name}: {_first_bad(np.asarray(weights))}, expected numbers or -inf")
+        raise not_a_number(name, np.isnan(weights) | np.isposinf(weights))
+
+
+def not_a_number(name: str, where: np.ndarray, hint: str = "") -> ValueError:
+    """The exception for NaN or +inf in a table, true in `where`."""
+    place = np.argwhere(where)[0].tolist()
+    return ValueError(f"{name}: NaN or +inf at {place}, expected numbers or -inf{hint}")
 
 
 def left_to_right(mean_samples: ArrayLike, presence: ArrayLike | None = None) -> Chain:
     """Chain of memoryless (geometric) durations with these means [samples], at least 1.
 
-    `presence`: probability that each state occurs at all; below 1, the state is optional and may be
-    passed over. All weights are probabilities; the last state lasts to the end.
+    `presence`: probability that each state occurs; below 1, the state is optional and may be skipped. All
+    weights are probabilities; the last state lasts to the end.
     """
     leave = 1.0 / np.maximum(np.asarray(mean_samples, dtype=float), 1.0)
     there = np.ones(leave.size) if presence is None else np.asarray(presence, dtype=float)
@@ -167,10 +178,10 @@ def left_to_right(mean_samples: ArrayLike, presence: ArrayLike | None = None) ->
 
 
 def jumps_between(presence: ArrayLike) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Log probabilities of what comes next where states occur with these probabilities.
+    """Log probabilities of the next state if states occur with these probabilities.
 
-    From k to k + d (num_states - d,) for d = 1, 2, ... as far as any states can be passed over; of the first
-    state that occurs, and of the last (num_states,). ValueError outside of (0, 1].
+    Of going from k to k + d (num_states - d,) for d = 1, 2, ... as far as states can be skipped; of the first
+    and of the last state that occurs (num_states,). ValueError for probabilities outside (0, 1].
     """
     there = np.asarray(presence, dtype=float)
     if there.ndim != 1 or not ((there > 0) & (there <= 1)).all():
@@ -188,11 +199,9 @@ def jumps_between(presence: ArrayLike) -> tuple[list[np.ndarray], np.ndarray, np
     return jumps, initial, final
 
 
-def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:
-    """What to raise where no path has any weight: ValueError for +inf, else InfeasibleAlignment."""
+def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> InfeasibleAlignment:
+    """The exception that names the state at fault where no path has any weight."""
     ll = np.asarray(log_likelihoods)
-    if np.isposinf(ll).any():
-        return ValueError(f"log_likelihoods: {_first_bad(ll)}, expected numbers or -inf")
     possible = ~np.isneginf(ll)  # a row of NaN is no evidence
     reach = np.isfinite(chain.log_initial) & possible[0]
     reached = reach.copy()
@@ -213,15 +222,3 @@ def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:
     if len(ll) <= starving:
         return InfeasibleAlignment(starving, f"{len(ll)} samples are too few")
     return InfeasibleAlignment(starving, "no path reaches it")
-
-
-def not_numbers(log_likelihoods: np.ndarray, row: int) -> ValueError:
-    """What to raise for a row with NaN beside numbers."""
-    column = int(np.flatnonzero(np.isnan(np.asarray(log_likelihoods[row], dtype=float)))[0])
-    where = f"log_likelihoods: NaN or +inf at {[row, column]}"
-    return ValueError(f"{where}, expected numbers or -inf (a missing sample is NaN throughout)")
-
-
-def _first_bad(table: np.ndarray) -> str:
-    where = np.argwhere(np.isnan(table) | np.isposinf(table))[0].tolist()
-    return f"NaN or +inf at {where}"

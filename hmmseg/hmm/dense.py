@@ -1,8 +1,8 @@
-"""Hidden Markov model with any transition matrix: the alternative to a forced order.
+"""Hidden Markov model with an arbitrary transition matrix, the alternative to a forced order.
 
-A recording that does not follow its task is explained better by free switching among the same states;
-comparing log evidences needs this general model. Same conventions as hmmseg.hmm.inference (Rabiner,
-Proc. IEEE 77(2), 1989).
+A recording that departs from its task is explained better by free switching among the same states; comparing
+log evidences needs this general model. Conventions as in hmmseg.hmm.inference (Rabiner, Proc. IEEE 77(2),
+1989).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from hmmseg.hmm.inference import ladder
 from hmmseg.hmm.recursions import argmax, log_sum, row
 
-BLOCK = 16_384  # numerics: rows that one call takes, so that little is made of a long recording at once
+BLOCK = 16_384  # numerics: rows per call, which bounds the memory for a long recording
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def log_evidence(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transit
         log_transition: (num_states, num_states), [i, j] from i to j.
 
     Returns:
-        nats; -inf where no path exists, as a model without an order has no state to starve.
+        nats; -inf if no path exists (without an order, no single state is at fault).
 
     Raises:
         ValueError: NaN, wrong shapes.
@@ -53,18 +53,18 @@ def log_evidence(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transit
 
 
 def viterbi(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transition: ArrayLike) -> Path:
-    """Most probable state path; arguments as of `log_evidence`. ValueError where none is possible, too."""
+    """Most probable state path; arguments as of `log_evidence`. ValueError also if no path is possible."""
     weights, blocks, transition = _start(log_likelihoods, log_initial, log_transition)
-    taken = []
+    pointers = []
     with jax.enable_x64(True):
         for x, n in blocks:
             weights, sources = jax.tree.map(np.asarray, _pass(weights, x, transition, n, best=True))
-            taken.append((sources, n))
+            pointers.append((sources, n))
         if not np.isfinite(weights.max()):
             raise ValueError("no state path has any probability")
         k = weights.argmax()
         pieces = [np.array([k])]
-        for sources, n in reversed(taken):
+        for sources, n in reversed(pointers):
             piece = np.asarray(_back(sources, np.int32(k), n))[:n]
             pieces.append(piece)
             k = piece[0]
@@ -72,7 +72,7 @@ def viterbi(log_likelihoods: ArrayLike, log_initial: ArrayLike, log_transition: 
 
 
 def _start(*arrays: ArrayLike) -> tuple[np.ndarray, Iterator[tuple[np.ndarray, np.int32]], np.ndarray]:
-    """Weights (num_states,) at the first row; further rows, in padded blocks, and their numbers."""
+    """Weights (num_states,) at the first row, padded blocks of the other rows, and the transitions."""
     ll, initial, transition = (np.asarray(a, dtype=np.float64) for a in arrays)
     num_states = ll.shape[-1]
     expected = ((len(ll), num_states), (num_states,), (num_states, num_states))
@@ -95,10 +95,7 @@ def _start(*arrays: ArrayLike) -> tuple[np.ndarray, Iterator[tuple[np.ndarray, n
 
 @partial(jax.jit, static_argnames="best")
 def _pass(weights: Array, x: Array, transition: Array, n: Array, best: bool) -> tuple[Array, Array]:
-    """Weights (num_states,) of all paths to each state, or of the best, n rows further on.
-
-    Also from where the best came to each row.
-    """
+    """Weights (num_states,) of all paths to each state, or of the best, n rows later, and back-pointers."""
 
     def step(t: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         ways, sources = carry[0][:, None] + transition, carry[1]
@@ -113,7 +110,7 @@ def _pass(weights: Array, x: Array, transition: Array, n: Array, best: bool) -> 
 
 @jax.jit
 def _back(sources: Array, k: Array, n: Array) -> Array:
-    """States before each of n rows, of the path that is in state k at the last of them."""
+    """States before each of n rows, on the path that is in state k at the last of them."""
 
     def step(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         t, (k, path) = n - 1 - i, carry

@@ -1,10 +1,10 @@
-"""Chains whose states last by tables of durations (semi-Markov), of any shape and with no state split.
+"""Chains whose states have duration tables of any shape (semi-Markov), without splitting states.
 
-`enter` [t, k]: weight of all that comes before a state k that begins with sample t; `leave` [t, k]: of
-all up to the end of a state k whose last sample is t - 1. A window holds, for each state and each
-duration so far, the weight of having begun that long ago, and is shifted by one duration a sample: time
-is O(num_samples num_states longest), memory beside the tables O(num_states longest), and samples that a
-state forbids need no case of their own.
+`enter` [t, k]: weight of everything before a state k that begins with sample t; `leave` [t, k]: of everything
+up to the end of a state k whose last sample is t - 1. A window holds, for each state and elapsed duration,
+the weight of having begun that long ago, and shifts by one duration per sample: time is O(num_samples
+num_states longest), memory besides the tables O(num_states longest), and samples forbidden to a state need no
+special case. The recursions run row by row on every device, so `parallel` has no effect.
 
 Yu, Artificial Intelligence 174(2), 2010, for states in a known order.
 """
@@ -18,33 +18,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.tree_util import register_pytree_node_class
 from numpy.typing import ArrayLike
 
-from hmmseg.hmm.chain import InfeasibleAlignment, end_weights, jumps_between
+from hmmseg.hmm.chain import InfeasibleAlignment, Leaves, end_weights, jumps_between
 from hmmseg.hmm.recursions import NEVER, backwards, forwards, known, log_add, log_sum, numbers, pick, row
 
-RARE = 1e-12  # numerics: durations that are longer than all but this share are left out
+RARE = 1e-12  # numerics: probability of the longest durations, which are left out
 
 
-@register_pytree_node_class
-class DurationChain:
+class DurationChain(Leaves):
     """Left-to-right chain with a distribution of durations for each state; a pytree.
 
     Args:
-        log_durations: one array a state, entry n - 1 the log probability (or weight) of lasting n samples;
-            what is longer is impossible.
-        presence: (num_states,), probability that each state occurs at all; 1 unless given.
-        open_end: the recording may cut the last state off, which then has lasted at least so long.
-        log_initial, log_final: (num_states,), weights of the first and of the last state; unless given,
-            the first and last that occur.
+        log_durations: one array per state; entry n - 1 is the log probability (or weight) of lasting n
+            samples; longer durations are impossible.
+        presence: (num_states,), probability that each state occurs; 1 by default.
+        open_end: the recording may truncate the last state, which has then lasted at least that long.
+        log_initial, log_final: (num_states,), weights of the first and of the last state; by default, those
+            that occur first and last.
 
     Raises:
         ValueError: wrong shapes, NaN, +inf, or a state without a possible duration.
     """
 
     varying, num_samples = False, None  # as of a Chain whose weights do not change in time
-    _LEAVES = ("pmf", "survival", "jumps", "log_initial", "log_final")
+    leaves = ("pmf", "survival", "jumps", "log_initial", "log_final")
     pmf: np.ndarray  # (num_states, longest): log probability of lasting n samples in column n - 1
     survival: np.ndarray  # the same for a state that the recording's end cuts off
     jumps: np.ndarray  # (num_bands, num_states): jumps[d - 1, k] from k to k + d
@@ -78,29 +76,17 @@ class DurationChain:
         self.log_initial = end_weights("log_initial", log_initial, initial)
         self.log_final = end_weights("log_final", log_final, final)
 
-    def tree_flatten(self) -> tuple[tuple, None]:
-        """The tables, for JAX."""
-        return tuple(getattr(self, name) for name in self._LEAVES), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, leaves: tuple) -> DurationChain:
-        """A chain of tables that are whatever JAX puts in their places."""
-        chain = object.__new__(cls)
-        for name, leaf in zip(cls._LEAVES, leaves, strict=True):
-            setattr(chain, name, leaf)
-        return chain
-
     @property
     def num_states(self) -> int:
-        """How many states it has."""
+        """Number of states."""
         return self.pmf.shape[0]
 
 
 def lasting(mean_samples: ArrayLike, sd_samples: ArrayLike, presence: ArrayLike | None = None, *,
             open_end: bool = False) -> DurationChain:  # fmt: skip
-    """Chain of durations with these means and standard deviations [samples]: gamma, read in whole samples.
+    """Chain of gamma-distributed durations with these means and sds [samples], read in whole samples.
 
-    Raises ValueError where one is not above 0 or the shapes differ.
+    Raises ValueError unless all are above 0 and the shapes agree.
     """
     from scipy.stats import gamma
 
@@ -126,12 +112,11 @@ def _forward(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Ar
     """Log evidence, `enter` (num_samples, num_states) and `leave` (num_samples + 1, num_states)."""
 
     def step(t: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        enter, leave, window = carry  # of having begun 1, 2, ... samples before sample t - 1
+        enter, leave, window = carry  # window: begun 1, 2, ... samples before sample t - 1
         window = forwards(window, 1).at[:, 0].set(row(enter, t - 1)) + known(row(x, t - 1))[:, None]
         left = log_sum(window + jnp.where(t == n, chain.survival, chain.pmf), 1)
         leave = lax.dynamic_update_index_in_dim(leave, left, t, 0)
         entering = reduce(log_add, [forwards(left + j, d) for d, j in enumerate(jnp.asarray(chain.jumps), 1)])
-        # Beyond the last sample is a row that nothing reads.
         enter = lax.dynamic_update_index_in_dim(enter, entering, t, 0)
         return enter, leave, window
 
@@ -141,23 +126,25 @@ def _forward(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Ar
     return log_sum(row(leave, n) + chain.log_final, 0), enter[:-1], leave
 
 
-def evidence(x: Array, chain: DurationChain, n: Array) -> Array:
+def evidence(x: Array, chain: DurationChain, n: Array, parallel: bool | None) -> Array:
     """Log of the summed weight of all paths."""
+    del parallel
     return _forward(x, _arrays(chain), n)[0]
 
 
-def posterior(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Array]:
-    """Log evidence, and probabilities of states and moves, as recursions.posterior gives them.
+def posterior(x: Array, chain: DurationChain, n: Array, parallel: bool | None) -> tuple[Array, Array, Array]:
+    """Log evidence, and probabilities of states and moves, as recursions.posterior returns them.
 
-    Of moves, those of staying are left out (zeros).
+    Moves that stay are omitted (zeros).
     """
+    del parallel
     chain = _arrays(chain)
     total, enter, leave = _forward(x, chain, n)
     longest = chain.pmf.shape[1]
     ages = numbers(longest) + 1
 
     def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        after, rest, window = carry  # of ending 1, 2, ... samples from t on, with all that follows
+        after, rest, window = carry  # window: ends 1, 2, ... samples from t on
         t = n - 1 - i
         ends = jnp.where(t == n - 1, chain.log_final, row(rest, jnp.minimum(t + 1, len(x) - 1)))
         window = forwards(window, 1).at[:, 0].set(ends) + known(row(x, t))[:, None]
@@ -166,7 +153,7 @@ def posterior(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, A
         moved = [backwards(begun, d) + jump for d, jump in enumerate(chain.jumps, 1)]
         return after, lax.dynamic_update_index_in_dim(rest, reduce(log_add, moved), t, 0), window
 
-    nothing = jnp.full(x.shape, NEVER)  # rest [t, k]: of all that follows a state k that has ended before t
+    nothing = jnp.full(x.shape, NEVER)  # rest [t, k]: all that follows a state k that ended before t
     start = (nothing, nothing, jnp.full(chain.pmf.shape, NEVER))
     after, rest, _ = lax.fori_loop(jnp.int32(0), n, step, start)
     none = jnp.where(jnp.isfinite(total), total, 0.0)
@@ -178,12 +165,15 @@ def posterior(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, A
     return total, states, jnp.stack([jnp.zeros_like(to[0]), *to], 1)
 
 
-def draw(x: Array, chain: DurationChain, n: Array, key: Array, num_draws: int) -> tuple[Array, Array]:
+def draw(
+    x: Array, chain: DurationChain, n: Array, key: Array, num_draws: int, parallel: bool | None
+) -> tuple[Array, Array]:
     """Log evidence, and starts (num_draws, num_states) drawn from the posterior."""
+    del parallel
     chain = _arrays(chain)
     total, enter, leave = _forward(x, chain, n)
     states, (num_states, longest) = numbers(x.shape[1]), chain.pmf.shape
-    front = ((longest, 0), (0, 0))  # rows before the first, that no state may begin with
+    front = ((longest, 0), (0, 0))  # rows before the first, where no state may begin
     enter, padded = jnp.pad(enter, front, constant_values=NEVER), jnp.pad(known(x), front)
 
     def one(key: Array) -> Array:
@@ -210,11 +200,18 @@ def draw(x: Array, chain: DurationChain, n: Array, key: Array, num_draws: int) -
     return total, jax.vmap(one)(jax.random.split(key, num_draws))
 
 
-def rank(x: Array, chain: DurationChain, n: Array, count: int) -> tuple[Array, Array]:
-    """Starts (count, num_states) and log weights (count,) of the best paths; -inf where fewer are possible.
+def best_path(x: Array, chain: DurationChain, n: Array, parallel: bool | None) -> tuple[Array, Array]:
+    """Starts (num_states,) and log weight of the most probable path."""
+    del parallel
+    starts, log_prob = rank(x, chain, n, 1)
+    return starts[0], log_prob[0]
 
-    Every end of a state keeps its `count` best histories, each by how long the state lasted and the rank of
-    what it continues, every begin by the jump that led to it. A tie goes to the shorter stay.
+
+def rank(x: Array, chain: DurationChain, n: Array, count: int) -> tuple[Array, Array]:
+    """Starts (count, num_states) and log weights (count,) of the best paths; -inf if there are fewer.
+
+    Every end of a state keeps its `count` best histories, each by the duration of the state and the rank of
+    its predecessor, every start those by the jump that led to it. A tie goes to the shorter stay.
     """
     chain = _arrays(chain)
     (num_states, longest), states = chain.pmf.shape, numbers(x.shape[1])
@@ -255,11 +252,8 @@ def rank(x: Array, chain: DurationChain, n: Array, count: int) -> tuple[Array, A
     return jax.vmap(back)(ends), log_prob
 
 
-def why_infeasible(x: np.ndarray, chain: DurationChain) -> ValueError:
-    """What to raise where no path has any weight: ValueError for +inf, else InfeasibleAlignment."""
-    if np.isposinf(x).any():
-        return ValueError(f"log_likelihoods: +inf at {np.argwhere(np.isposinf(x))[0].tolist()}, "
-                          "expected numbers or -inf")  # fmt: skip
+def why_infeasible(x: np.ndarray, chain: DurationChain) -> InfeasibleAlignment:
+    """The exception that names the state at fault where no path has any weight."""
     with jax.enable_x64(True):
         enter = np.asarray(_forward(jnp.asarray(x), _arrays(chain), jnp.int32(len(x)))[1])
     deepest = int(np.flatnonzero(np.isfinite(enter).any(axis=0)).max(initial=0))

@@ -1,25 +1,23 @@
 """Alignments and posteriors of recordings under a chain: the functions of hmmseg.hmm.
 
-Log-likelihoods are (num_samples, num_states); a row of NaN is a missing sample, no evidence either way.
-Sums are made in double precision, whatever the process's JAX is set to. Every function may be called in
-two ways:
+Log-likelihoods are (num_samples, num_states); a row of NaN is a missing sample, no evidence either way. Sums
+are in double precision, whatever the process's JAX setting. Every function can be called in two ways:
 
-- on plain arrays: it compiles once for a short ladder of lengths, returns NumPy arrays, and raises
-  InfeasibleAlignment where no path exists and ValueError for NaN beside numbers, for +inf and for wrong
-  shapes;
-- inside jit, vmap or grad, with `length` for what is no padding: nothing of the data can raise there, a
-  log weight is -inf where no path exists and NaN where a row holds NaN beside numbers. vmap runs
-  recordings one after the other on a CPU, together elsewhere.
+- on plain arrays: it is compiled once for each of a short ladder of lengths, returns NumPy arrays, and raises
+  InfeasibleAlignment if no path exists and ValueError for NaN beside numbers, for +inf and for wrong shapes;
+- inside jit, vmap or grad, with `length` to exclude padding: the data cannot raise there; a log weight is
+  -inf if no path exists and NaN if a row holds NaN beside numbers. vmap runs recordings in turn on a CPU,
+  together elsewhere.
 
-`parallel`: solve the recursions in time by associative scans (see recursions.py); unless said, not on a
-CPU.
+`parallel`: solve the recursions in time by associative scans (see recursions.py); by default not on a CPU.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -28,18 +26,18 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from hmmseg.hmm import durations, recursions
-from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
+from hmmseg.hmm.chain import Chain, not_a_number, why_infeasible
 from hmmseg.hmm.durations import DurationChain
 from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filtered, Posterior
 
 AnyChain = Chain | DurationChain
 SHORTEST = 128  # numerics: samples; the first step of the ladder of lengths
-TOGETHER = 64  # numerics: recordings of one shape that make one call; what is over is done one by one
+TOGETHER = 64  # numerics: recordings of one shape per call; the remainder is processed one by one
 MAX_RANKS = 65_535  # limit: of k_best
 
 
 def ladder(num_samples: int) -> int:
-    """The length to which a recording is padded: powers of two, from 4,096 on with quarters between them."""
+    """Padded length of a recording: powers of two, from 4,096 on with quarter steps between them."""
     below = max(SHORTEST, 1 << (num_samples - 1).bit_length()) // 2
     step = below // 4 if below >= 4096 else 2 * below
     return -(-num_samples // step) * step
@@ -52,12 +50,12 @@ def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
     Args:
         log_likelihoods: (num_samples, num_states). Several recordings, not under jit: a sequence of such
             arrays, or (num_recordings, num_samples, num_states) with `lengths` (num_recordings,).
-        chain: one, or one for each recording.
-        lengths: how many samples are no padding; all unless given.
+        chain: one, or one per recording.
+        lengths: number of samples that are no padding; all by default.
         parallel: see the module.
 
     Returns:
-        Alignment, of several recordings Alignments.
+        Alignment, for several recordings Alignments.
 
     Raises:
         InfeasibleAlignment, ValueError: see the module.
@@ -65,12 +63,12 @@ def viterbi(log_likelihoods: Any, chain: Any, lengths: Any = None, *,
     if getattr(log_likelihoods, "ndim", 0) == 2 and isinstance(chain, AnyChain):
         return _run(_viterbi, log_likelihoods, chain, lengths, parallel=parallel)
     tables, chains = recordings(log_likelihoods, chain, lengths)
-    found = run_many(_viterbi, tables, chains, parallel=parallel)
+    best = run_many(_viterbi, tables, chains, parallel=parallel)
     num_states = chains[0].num_states if chains else 0
     return Alignments(
-        np.array([a.starts for a in found], np.int64).reshape(len(found), num_states),
-        np.array([a.num_samples for a in found], np.int64),
-        np.array([a.log_prob for a in found], float),
+        np.array([a.starts for a in best], np.int64).reshape(len(best), num_states),
+        np.array([a.num_samples for a in best], np.int64),
+        np.array([a.log_prob for a in best], float),
     )
 
 
@@ -78,7 +76,7 @@ def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None
                  parallel: bool | None = None) -> Any:  # fmt: skip
     """Log of the summed weight of all paths.
 
-    Differentiable once, in reverse: its gradient with respect to the log-likelihoods is the posterior
+    Differentiable once, in reverse mode: the gradient with respect to the log-likelihoods is the posterior
     probability of each state at each sample, with respect to the weights of a chain the expected number of
     moves. Arguments and exceptions as of `viterbi`.
     """
@@ -87,7 +85,7 @@ def log_evidence(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None
 
 def filter(log_likelihoods: ArrayLike, chain: AnyChain, length: Any = None, *,
            parallel: bool | None = None) -> Filtered:  # fmt: skip
-    """What each sample says together with those before it. Arguments and exceptions as of `viterbi`."""
+    """Probabilities of states given the samples so far. Arguments and exceptions as of `viterbi`."""
     return _run(_filter, log_likelihoods, chain, length, parallel=parallel)
 
 
@@ -101,66 +99,63 @@ def sample(log_likelihoods: ArrayLike, chain: AnyChain, num_draws: int, seed: An
            length: Any = None) -> Alignments:  # fmt: skip
     """Independent exact draws from the posterior over alignments.
 
-    `seed`: a number, or a key of jax.random. `log_prob` is NaN. Further arguments as of `viterbi`.
+    `seed`: an integer, or a key of jax.random. `log_prob` is NaN. Further arguments as of `viterbi`.
     """
     key = jax.random.key(seed) if isinstance(seed, (int, np.integer)) else seed
     return _run(_sample, log_likelihoods, chain, length, key, num_draws=num_draws, parallel=None)
 
 
 def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int, length: Any = None) -> Alignments:
-    """The k most probable alignments, best first; fewer where fewer are possible (under jit: -inf).
+    """The k most probable alignments, best first; fewer if fewer are possible (under jit: -inf).
 
     Arguments and exceptions as of `viterbi`.
     """
     if not 0 < k <= MAX_RANKS:
         raise ValueError(f"k: {k}, expected 1 to {MAX_RANKS}")
-    found = _run(_k_best, log_likelihoods, chain, length, k=k, parallel=None)
-    if not isinstance(found.log_prob, np.ndarray):
-        return found
-    keep = int(np.isfinite(found.log_prob).sum())
-    return Alignments(found.starts[:keep], found.num_samples[:keep], found.log_prob[:keep])
+    best = _run(_k_best, log_likelihoods, chain, length, k=k, parallel=None)
+    if not isinstance(best.log_prob, np.ndarray):
+        return best
+    keep = int(np.isfinite(best.log_prob).sum())
+    return Alignments(best.starts[:keep], best.num_samples[:keep], best.log_prob[:keep])
 
 
-# What the functions compute: of rows x without NaN and a length n, padded or not, the log weight that must be
-# finite for there to be an answer, and the answer.
+# The cores: of log-likelihoods x, padded or not, with n valid rows, each returns the log weight that must be
+# finite for an answer to exist, and the answer.
 
 
-def _tables(chain: Chain) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _solver(chain: Any) -> tuple[Any, tuple]:
+    """The module of a chain's recursions, and its weights as their arguments."""
+    if isinstance(chain, DurationChain):
+        return durations, (chain,)
     initial, final = (jnp.asarray(end).astype(jnp.float64) for end in (chain.log_initial, chain.log_final))
-    return chain.by_target(jnp), initial, final
+    return recursions, (chain.by_target(jnp), initial, final)
 
 
 def _viterbi(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Alignment]:
-    if isinstance(chain, DurationChain):
-        starts, log_prob = durations.rank(x, chain, n, 1)
-        starts, log_prob = starts[0], log_prob[0]
-    else:
-        starts, log_prob = recursions.best_path(x, *_tables(chain), n, parallel=parallel)
+    solver, weights = _solver(chain)
+    starts, log_prob = solver.best_path(x, *weights, n, parallel=parallel)
     return log_prob, Alignment(starts, n, log_prob)
 
 
 def _log_evidence(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
-    if isinstance(chain, DurationChain):
-        total = durations.evidence(x, chain, n)
-    else:
-        total = recursions.evidence(x, *_tables(chain), n, parallel=parallel)
+    solver, weights = _solver(chain)
+    total = solver.evidence(x, *weights, n, parallel=parallel)
     return total, total
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
 def _differentiable(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> jax.Array:
-    """The log evidence in the precision of x. Its gradient is the posterior, in that of what it is of."""
+    """The log evidence in the precision of x; gradients are posteriors in that of their argument."""
     with jax.enable_x64(True):
         return _log_evidence(x, chain, n, parallel)[0].astype(x.dtype)
 
 
 def _with_gradient(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
     with jax.enable_x64(True):
-        if isinstance(chain, DurationChain):
-            total, states, _ = durations.posterior(x, chain, n)
-            by_chain = None
-        else:
-            total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
+        solver, weights = _solver(chain)
+        total, states, moves = solver.posterior(x, *weights, n, parallel=parallel)
+        by_chain = None
+        if isinstance(chain, Chain):
             bands = [moves[:, d, d:] for d in range(len(chain.bands))]
             bands = [each if band.ndim == 2 else each.sum(0)
                      for each, band in zip(bands, chain.bands, strict=True)]  # fmt: skip
@@ -182,7 +177,7 @@ _differentiable.defvjp(_with_gradient, _pull_back)
 def _filter(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Filtered]:
     if isinstance(chain, DurationChain):
         raise ValueError("chain: tables of durations, expected a Chain")
-    w, initial, final = _tables(chain)
+    w, initial, final = _solver(chain)[1]
     table, taken = recursions.forward(x, w, initial, n, recursions.log_add, parallel)
     table = jnp.where((recursions.numbers(len(x)) < n)[:, None], table, recursions.NEVER)
     total = recursions.log_sum(recursions.row(table, n - 1) + final, 0) + taken
@@ -190,30 +185,24 @@ def _filter(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tu
 
 
 def _smooth(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Posterior]:
-    if isinstance(chain, DurationChain):
-        total, states, moves = durations.posterior(x, chain, n)
-    else:
-        total, states, moves = recursions.posterior(x, *_tables(chain), n, parallel=parallel)
+    solver, weights = _solver(chain)
+    total, states, moves = solver.posterior(x, *weights, n, parallel=parallel)
     return total, Posterior(total, states, tuple(moves[:, d, d:] for d in range(1, moves.shape[1])))
 
 
 def _sample(x: jax.Array, chain: Any, n: jax.Array, key: jax.Array, num_draws: int,
             parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
-    if isinstance(chain, DurationChain):
-        total, starts = durations.draw(x, chain, n, key, num_draws)
-    else:
-        total, starts = recursions.draw(x, *_tables(chain), n, key, num_draws, parallel)
-    unknown = jnp.where(jnp.isfinite(total), jnp.nan, total)  # -inf where there was no path to draw
+    solver, weights = _solver(chain)
+    total, starts = solver.draw(x, *weights, n, key, num_draws, parallel)
+    unknown = jnp.where(jnp.isfinite(total), jnp.nan, total)  # -inf if there is no path to draw
     return total, Alignments(starts, jnp.full(num_draws, n), jnp.full(num_draws, unknown))
 
 
 def _k_best(x: jax.Array, chain: Any, n: jax.Array, k: int,
             parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
-    del parallel  # ranks are found row by row on every device
-    if isinstance(chain, DurationChain):
-        starts, log_prob = durations.rank(x, chain, n, k)
-    else:
-        starts, log_prob = recursions.rank(x, *_tables(chain), n, k)
+    del parallel  # ranks are computed row by row on every device
+    solver, weights = _solver(chain)
+    starts, log_prob = solver.rank(x, *weights, n, k)
     return log_prob[0], Alignments(starts, jnp.full(k, n), log_prob)
 
 
@@ -222,12 +211,12 @@ def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tup
     return total, (_viterbi(x, chain, n, parallel)[1], posterior)
 
 
-# How they are called.
+# How the cores are called.
 
 
 def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,
          inside: Callable | None = None, parallel: bool | None, **static: Any) -> Any:  # fmt: skip
-    """The core on one recording: traced where anything of it is, else compiled, as NumPy arrays."""
+    """Run a core on one recording: inline if anything is traced, else compiled, returning NumPy arrays."""
     leaves = jax.tree.leaves((log_likelihoods, chain, length, keys))
     if not any(isinstance(leaf, Tracer) for leaf in leaves):
         table = checked(log_likelihoods, chain)
@@ -237,27 +226,34 @@ def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: A
     x = jnp.asarray(log_likelihoods)
     _check_shape(x, chain)
     with jax.enable_x64(True):
-        # By way of uint32, as NumPy's 64 bits under vmap pass for 32 where JAX is set to these.
+        # Via uint32, as 64-bit NumPy integers under vmap are taken for 32 bits if JAX is set to these.
         n = jnp.asarray(len(x) if length is None else length).astype(jnp.uint32).astype(jnp.int32)
         kind = x.dtype if jnp.issubdtype(x.dtype, jnp.floating) else jnp.dtype(float)
         if inside is not None:
             return inside(
                 x.astype(kind), jax.tree.map(lambda leaf: jnp.asarray(leaf, kind), chain), n, parallel
             )
-        found = core(x, chain, n, *keys, parallel=parallel, **static)[1]
-        return jax.tree.map(lambda a: a.astype(kind) if a.dtype == jnp.float64 else a, found)
+        result = core(x, chain, n, *keys, parallel=parallel, **static)[1]
+        return jax.tree.map(lambda a: a.astype(kind) if a.dtype == jnp.float64 else a, result)
 
 
 def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
-    """Doubles (num_samples, num_states); ValueError for what is no such table."""
+    """Doubles (num_samples, num_states); ValueError for anything else."""
     ll = np.asarray(log_likelihoods, dtype=np.float64)
     _check_shape(ll, chain)
     missing = np.isnan(ll)
-    if missing.any():
-        partly = missing.any(1) & ~missing.all(1)
-        if partly.any():
-            raise not_numbers(ll, int(partly.argmax()))
+    partly = missing & ~missing.all(1, keepdims=True)
+    if partly.any():
+        raise not_a_number("log_likelihoods", partly, " (a missing sample is NaN throughout)")
     return ll
+
+
+def _failure(x: np.ndarray, chain: AnyChain) -> ValueError:
+    """The exception for a recording without a finite log weight."""
+    if np.isposinf(x).any():
+        return not_a_number("log_likelihoods", np.isposinf(x))
+    why: Callable = durations.why_infeasible if isinstance(chain, DurationChain) else why_infeasible
+    return why(x, chain)
 
 
 def _check_shape(ll: Any, chain: AnyChain) -> None:
@@ -297,7 +293,7 @@ def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
 
 def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any], *keys: Any,
              parallel: bool | None = None, **static: Any) -> list:  # fmt: skip
-    """The core on checked recordings, each padded to the ladder: one program for all of one shape.
+    """Run a core on checked recordings, each padded to the ladder: one program per shape.
 
     Raises InfeasibleAlignment, and ValueError for +inf.
     """
@@ -308,7 +304,7 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any]
     for i, (ll, chain) in enumerate(zip(tables, padded, strict=True)):
         leaves, kind = jax.tree.flatten(chain)
         groups.setdefault((ladder(len(ll)), kind, *(np.shape(leaf) for leaf in leaves)), []).append(i)
-    found: list[Any] = [None] * len(tables)
+    results: list[Any] = [None] * len(tables)
     for (size, *_), members in groups.items():
         whole = len(members) // TOGETHER * TOGETHER
         parts = [members[i : i + TOGETHER] for i in range(0, whole, TOGETHER)] + [
@@ -322,23 +318,12 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any]
             chain = jax.tree.map(lambda *leaves: np.stack(leaves), *(padded[i] for i in part))
             with jax.enable_x64(True):
                 program = compiled(core, parallel, tuple(sorted(static.items())))
-                totals, results = jax.tree.map(np.asarray, program(x, chain, n, *keys))
+                totals, batch = jax.tree.map(np.asarray, program(x, chain, n, *keys))
             for j, i in enumerate(part):
                 if not np.isfinite(totals[j]):
-                    why = durations.why_infeasible if isinstance(chains[i], DurationChain) else why_infeasible
-                    raise why(tables[i], chains[i])
-                found[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], results), len(tables[i]))
-    return found
-
-
-def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> list[AlignmentPosterior]:
-    """`viterbi` and `smooth` of several recordings, as EM takes them."""
-    return [
-        AlignmentPosterior(
-            posterior.log_evidence, posterior.smoothed, posterior.moves, best.path, best.log_prob
-        )
-        for best, posterior in run_many(_align, *recordings(log_likelihoods, chains, None))
-    ]
+                    raise _failure(tables[i], chains[i])
+                results[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], batch), len(tables[i]))
+    return results
 
 
 @cache
@@ -369,7 +354,7 @@ def _padded(chain: AnyChain, num_samples: int) -> AnyChain:
 
 
 def _trimmed(result: Any, n: int) -> Any:
-    """The result without the rows of padding, numbers as Python has them."""
+    """The result without the rows of padding, scalars as Python numbers."""
     if isinstance(result, tuple):
         return tuple(_trimmed(each, n) for each in result)
     if isinstance(result, Posterior):
@@ -382,3 +367,69 @@ def _trimmed(result: Any, n: int) -> Any:
     if isinstance(result, Alignments):
         return Alignments(result.starts.astype(np.int64), result.num_samples, result.log_prob)
     return float(result)
+
+
+# Expectation maximisation.
+
+
+def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> list[AlignmentPosterior]:
+    """`viterbi` and `smooth` of several recordings, as used by EM."""
+    return [
+        AlignmentPosterior(
+            posterior.log_evidence, posterior.smoothed, posterior.moves, best.path, best.log_prob
+        )
+        for best, posterior in run_many(_align, *recordings(log_likelihoods, chains, None))
+    ]
+
+
+M = TypeVar("M")
+LEAST_ITERATIONS = 6  # numerics: before the evidence may have settled
+
+
+@dataclass(frozen=True)
+class Learned(Generic[M]):
+    """A fitted model, with every trial's most probable path and posterior under it."""
+
+    model: M
+    alignments: tuple[AlignmentPosterior, ...]
+    converged: bool = False
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence of all trials [nats]."""
+        return sum(each.log_evidence for each in self.alignments)
+
+
+def em(model: M, tables: Callable[[M], tuple[Sequence[np.ndarray], Sequence[Chain]]],
+       updated: Callable[[M, Sequence[np.ndarray]], M], max_iterations: int = 40,
+       tolerance: float = 1e-3) -> Learned[M]:  # fmt: skip
+    """Alternate expectation and maximisation until the log evidence changes by less than `tolerance` nats.
+
+    The last step is an expectation. Trials of any lengths are pooled; emissions and durations are up to the
+    caller (those by a network need no such driver, as `log_evidence` has a gradient). Dempster, Laird and
+    Rubin, J. R. Stat. Soc. B 39, 1977; Rabiner, Proc. IEEE 77(2), 1989.
+
+    Args:
+        model: initial model.
+        tables: maps a model to each trial's log-likelihoods (num_timesteps, num_states), -inf for impossible
+            states, and its chain.
+        updated: the M-step: a new model, given each trial's posterior state probabilities.
+        max_iterations: limit, after which the result is unconverged.
+        tolerance: nats.
+
+    Returns:
+        The final model.
+
+    Raises:
+        InfeasibleAlignment: a trial is too short for its states.
+        ValueError: NaN.
+    """
+    before = -np.inf
+    for iteration in range(1, max_iterations + 1):
+        fit = Learned(model, tuple(align(*tables(model))))
+        if iteration > LEAST_ITERATIONS and abs(fit.log_evidence - before) < tolerance:
+            return Learned(model, fit.alignments, converged=True)
+        if iteration < max_iterations:
+            before = fit.log_evidence
+            model = updated(model, [each.smoothed for each in fit.alignments])
+    return fit

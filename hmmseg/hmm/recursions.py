@@ -1,18 +1,16 @@
 """The recursions over a chain's states and time, as pure JAX functions in double precision.
 
-Conventions of this file: `x` (num_timesteps, num_states) log-likelihoods, a row of NaN where a sample is
-missing; `w` (num_timesteps
-- 1 or 1, num_bands, num_states) log weights by their target, w[t, d, k] of going from k - d to k between
-the samples t and t + 1, -inf where k < d, one row where they do not vary; `n` int32, how many rows are
-no padding. A table of the recursion has a row for every timestep; what lies beyond row n - 1 means
-nothing.
+Conventions of this file: `x` (num_timesteps, num_states) log-likelihoods, a row of NaN for a missing sample;
+`w` (num_timesteps - 1 or 1, num_bands, num_states) log weights by target, w[t, d, k] of going from k - d to k
+between samples t and t + 1, -inf for k < d, a single row if constant; `n` int32, number of rows that are no
+padding. A recursion's table has a row for every timestep; rows beyond n - 1 are meaningless.
 
-A chain is triangular: no path returns to a state it has left. So there are two ways to run it. Row by
-row is the least work, and the fastest on a CPU. State by state, each state is a scalar linear recurrence
-in time, driven by the states before it, v[t] = (v[t - 1] + a[t]) + b[t] in the semiring, and linear
-recurrences are solved in logarithmic time by an associative scan (Blelloch, CMU-CS-90-190, 1990). This
-is the parallel inference of Hassan, Särkkä and García-Fernández, IEEE Trans. Signal Process. 69, 2021,
-with elements of two numbers instead of matrices of num_states x num_states.
+A chain is triangular: no path returns to a state it has left. It can therefore be solved in two ways. Row by
+row takes least work and is fastest on a CPU. State by state, each state is a scalar linear recurrence in
+time, driven by the states before it, v[t] = (v[t - 1] + a[t]) + b[t] in the semiring, and linear recurrences
+are solved in logarithmic time by an associative scan (Blelloch, CMU-CS-90-190, 1990). This is the parallel
+inference of Hassan, Särkkä and García-Fernández, IEEE Trans. Signal Process. 69, 2021, with pairs of numbers
+instead of num_states x num_states matrices as elements.
 
 Rabiner, Proc. IEEE 77(2), 1989; sampling: Scott, J. Am. Stat. Assoc. 97, 2002.
 """
@@ -20,7 +18,7 @@ Rabiner, Proc. IEEE 77(2), 1989; sampling: Scott, J. Am. Stat. Assoc. 97, 2002.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import partial, reduce, wraps
 from typing import Any
 
 import jax
@@ -32,25 +30,25 @@ from hmmseg.jaxconfig import keep_programs
 keep_programs()
 
 NEVER = -jnp.inf  # physics: the logarithm of no weight
-BLOCK = 256  # numerics: rows that a processor searches together for where a path entered its state
+BLOCK = 256  # numerics: rows that a CPU searches at once for where a path entered its state
 
 Operation = Callable[[Array, Array], Array]
 
 
 def log_add(a: Array, b: Array) -> Array:
-    """log(exp(a) + exp(b)), also where both are -inf."""
+    """log(exp(a) + exp(b)), also if both are -inf."""
     top = jnp.maximum(a, b)
     gap = jnp.where(top == NEVER, 0.0, jnp.minimum(a, b) - top)
     return top + jnp.log1p(jnp.exp(gap))
 
 
 def finite(top: Array) -> Array:
-    """What to take out of log weights of which `top` is the largest: nothing where it is -inf."""
+    """The largest log weight `top`, to be subtracted from all; 0 if it is -inf."""
     return jnp.where(jnp.isfinite(top), top, 0.0)
 
 
 def log_sum(values: Array, axis: int) -> Array:
-    """log of the sum of exponentials along an axis, also where all are -inf."""
+    """Log of the sum of exponentials along an axis, also if all are -inf."""
     top = finite(values.max(axis, keepdims=True))
     return jnp.log(jnp.exp(values - top).sum(axis)) + top.squeeze(axis)
 
@@ -61,9 +59,10 @@ def numbers(count: int) -> Array:
 
 
 def argmax(values: Array, axis: int = 0) -> Array:
-    """The first place of the largest value, int32.
+    """First place of the largest value, int32.
 
-    Of parts that are lowered alike when JAX is set to 32 bits by then, which lax.argmax is not.
+    Composed of operations that lower correctly even if JAX has been reset to 32 bits by then, unlike
+    lax.argmax.
     """
     places = lax.broadcasted_iota(jnp.int32, values.shape, axis)
     return jnp.where(values == values.max(axis, keepdims=True), places, values.shape[axis] - 1).min(axis)
@@ -76,31 +75,31 @@ def pick(key: Array, logits: Array, axis: int = 0) -> Array:
 
 
 def row(table: Array, t: Array) -> Array:
-    """table[t]; of the one row where nothing varies in time."""
+    """table[t], or the only row of a constant table."""
     return table[0] if len(table) == 1 else lax.dynamic_index_in_dim(table, t, keepdims=False)
 
 
 def known(x: Array) -> Array:
-    """Log-likelihoods (..., num_states) in double precision, zeros (no evidence) of a missing sample."""
+    """Log-likelihoods (..., num_states) in double precision, zeros (no evidence) for a missing sample."""
     x = x.astype(jnp.float64)
     return jnp.where(jnp.isnan(x).all(-1, keepdims=True), 0.0, x)
 
 
 def forwards(values: Array, d: int) -> Array:
-    """Of each state the value d states before it, -inf where there is none."""
+    """Shift by d states: for each state the value d states before it, -inf if there is none."""
     pads = [(0, 0, 0)] * (values.ndim - 1) + [(d, -d, 0)]
     return lax.pad(values, jnp.array(NEVER, values.dtype), pads)
 
 
 def backwards(values: Array, d: int, nothing: float = NEVER) -> Array:
-    """Of each state the value d states after it, `nothing` where there is none."""
+    """Shift by -d states: for each state the value d states after it, `nothing` if there is none."""
     pads = [(0, 0, 0)] * (values.ndim - 1) + [(-d, d, 0)]
     return lax.pad(values, jnp.array(nothing, values.dtype), pads)
 
 
 def by_device(parallel: bool | None, by_row: Callable[..., Any], by_state: Callable[..., Any],
               *args: Array) -> Any:  # fmt: skip
-    """The recursion row by row on a CPU, state by state elsewhere, unless `parallel` says which."""
+    """Run row by row on a CPU, state by state elsewhere, unless `parallel` decides."""
     if parallel is None:
         return lax.platform_dependent(*args, cpu=by_row, default=by_state)
     return (by_state if parallel else by_row)(*args)
@@ -108,9 +107,9 @@ def by_device(parallel: bool | None, by_row: Callable[..., Any], by_state: Calla
 
 def forward(x: Array, w: Array, initial: Array, n: Array, plus: Operation,
             parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
-    """Weights [t, k] of all paths (the best path, for `plus` a maximum) that are in state k at sample t.
+    """Weights [t, k] of all paths (the best path, for `plus` a maximum) in state k at sample t.
 
-    Of sums each row is known up to a constant, and the constant of row n - 1 comes second: sums grow with the
+    For sums, each row is known up to a constant, and that of row n - 1 is returned second: sums grow with the
     recording, and their rounding would show in the probabilities.
     """
 
@@ -151,7 +150,7 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Operation,
 
 
 def shares(before: Array, w: Array) -> Array:
-    """Of who is in state k, which share came from k - d (..., num_bands, num_states).
+    """Conditional probability (..., num_bands, num_states) of having come to state k from k - d.
 
     `before` (..., num_states): weights of all paths one sample earlier; `w` (..., num_bands, num_states).
     """
@@ -163,8 +162,8 @@ def shares(before: Array, w: Array) -> Array:
 def smooth(before: Array, w: Array, final: Array, n: Array, parallel: bool | None) -> tuple[Array, Array]:
     """Probabilities of states (num_timesteps, num_states) and moves, from the forward pass alone.
 
-    Who is in state k at sample t has come from k - d with a probability that the samples after t say nothing
-    about, so p[t - 1, j] = sum_d share[t, d, j + d] p[t, j + d] leads back from the last sample.
+    Given state k at sample t, its predecessor k - d does not depend on the samples after t, so
+    p[t - 1, j] = sum_d share[t, d, j + d] p[t, j + d] leads back from the last sample.
     """
     num_timesteps, num_states = before.shape
     num_bands = w.shape[1]
@@ -174,7 +173,7 @@ def smooth(before: Array, w: Array, final: Array, n: Array, parallel: bool | Non
         states = lax.dynamic_update_index_in_dim(jnp.zeros_like(before), last, n - 1, 0)
         moves = jnp.zeros((num_timesteps - 1, num_bands, num_states))
 
-        # The row is carried along with its table: where it is read back from there, XLA copies the table.
+        # The current row is carried too: reading it back from its table would make XLA copy the table.
         def step(i: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             t, (states, moves, now) = n - 1 - i, carry
             moved = now[None] * shares(row(before, t - 1), row(w, t - 1))
@@ -185,8 +184,8 @@ def smooth(before: Array, w: Array, final: Array, n: Array, parallel: bool | Non
         return lax.fori_loop(jnp.int32(0), n - 1, step, (states, moves, last))[:2]
 
     def by_state(before: Array, w: Array, last: Array, n: Array) -> tuple[Array, Array]:
-        there = (numbers(num_timesteps - 1) < n - 1)[:, None, None]  # from beyond, nothing has come
-        share = jnp.where(there, shares(before[:-1], w), 0.0)
+        inside = (numbers(num_timesteps - 1) < n - 1)[:, None, None]
+        share = jnp.where(inside, shares(before[:-1], w), 0.0)
         goes = [backwards(share[:, d], d, 0.0) for d in range(num_bands)]  # [t, k] of k + d at t + 1
         num = max(num_bands - 1, 1)  # columns after this one
 
@@ -207,7 +206,7 @@ def smooth(before: Array, w: Array, final: Array, n: Array, parallel: bool | Non
 
 
 def solve(a: Array, b: Array, times: Operation, plus: Operation, reverse: bool = False) -> Array:
-    """v (num_timesteps,) of v[t] = plus(times(v[t - 1], a[t]), b[t]), from v[-1] = nothing."""
+    """v (num_timesteps,) of v[t] = plus(times(v[t - 1], a[t]), b[t]), starting from nothing."""
 
     def join(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
         return times(first[0], second[0]), plus(times(first[1], second[0]), second[1])
@@ -216,9 +215,9 @@ def solve(a: Array, b: Array, times: Operation, plus: Operation, reverse: bool =
 
 
 def trace_back(table: Array, w: Array, k: Array, n: Array, block: int) -> Array:
-    """Starts (num_states,) of the best path that ends in state k, from its table; a tie goes to staying.
+    """Starts (num_states,) of the best path that ends in state k, from its table; ties go to staying.
 
-    Looks for the last entry into each state in blocks of rows, so that the path is no walk from row to row.
+    Searches blocks of rows for the last entry into each state, instead of walking from row to row.
     """
     num_timesteps, num_states = table.shape
     states, size = numbers(num_states), min(block, num_timesteps - 1)
@@ -243,77 +242,75 @@ def trace_back(table: Array, w: Array, k: Array, n: Array, block: int) -> Array:
     return lax.while_loop(lambda carry: (carry[0] > 0) & (carry[1] > 0), look, start)[2]
 
 
-def one_by_one(core: Callable, parallel: bool | None) -> Callable:
-    """The function, whose vmap runs recordings one after the other on a CPU, which keeps each in its cache.
+def one_by_one(function: Callable) -> Callable:
+    """Wrap a function so that vmap runs recordings in turn on a CPU, which keeps each in its cache.
 
-    The rule may be applied after the function was traced, outside of the setting to double precision in
-    which that was done.
+    The rule may be applied after tracing, outside the double-precision setting under which that was done.
     """
-    run = jax.custom_batching.custom_vmap(core)
 
-    @run.def_vmap
-    def rule(axis_size: int, in_batched: Sequence[bool], *args: Array):  # type: ignore[no-untyped-def]
-        def in_turn(*args: Array):  # type: ignore[no-untyped-def]
-            moving = [a for a, moves in zip(args, in_batched, strict=True) if moves]
+    @wraps(function)
+    def batchable(*args: Array, parallel: bool | None) -> Any:
+        core = partial(function, parallel=parallel)
+        run = jax.custom_batching.custom_vmap(core)
 
-            def each(moving: Sequence[Array]):  # type: ignore[no-untyped-def]
-                rest = iter(moving)
-                return run(*(next(rest) if moves else a for a, moves in zip(args, in_batched, strict=True)))
+        @run.def_vmap
+        def rule(axis_size: int, in_batched: Sequence[bool], *args: Array) -> Any:
+            def in_turn(*args: Array) -> Any:
+                moving = [a for a, moves in zip(args, in_batched, strict=True) if moves]
 
-            return lax.map(each, moving)
+                def each(moving: Sequence[Array]) -> Any:
+                    rest = iter(moving)
+                    return run(*(next(rest) if m else a for a, m in zip(args, in_batched, strict=True)))
 
-        together = jax.vmap(core, in_axes=[0 if moves else None for moves in in_batched])
-        with jax.enable_x64(True):
-            found = by_device(parallel, in_turn, together, *args)
-        return found, jax.tree.map(lambda _: True, found)
+                return lax.map(each, moving)
 
-    return run
+            together = jax.vmap(core, in_axes=[0 if moves else None for moves in in_batched])
+            with jax.enable_x64(True):
+                results = by_device(parallel, in_turn, together, *args)
+            return results, jax.tree.map(lambda _: True, results)
+
+        return run(*args)
+
+    return batchable
 
 
-def best_path(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
-              parallel: bool | None) -> tuple[Array, Array]:  # fmt: skip
+@one_by_one
+def best_path(
+    x: Array, w: Array, initial: Array, final: Array, n: Array, parallel: bool | None
+) -> tuple[Array, Array]:
     """Starts (num_states,) and log weight of the most probable path."""
-
-    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> tuple[Array, Array]:
-        table, _ = forward(x, w, initial, n, jnp.maximum, parallel)
-        last = row(table, n - 1) + final
-        k = argmax(last)
-        in_blocks, at_once = (partial(trace_back, block=size) for size in (BLOCK, len(x)))
-        return by_device(parallel, in_blocks, at_once, table, w, k, n), last[k]
-
-    return one_by_one(core, parallel)(x, w, initial, final, n)
+    table, _ = forward(x, w, initial, n, jnp.maximum, parallel)
+    last = row(table, n - 1) + final
+    k = argmax(last)
+    in_blocks, at_once = (partial(trace_back, block=size) for size in (BLOCK, len(x)))
+    return by_device(parallel, in_blocks, at_once, table, w, k, n), last[k]
 
 
-def posterior(x: Array, w: Array, initial: Array, final: Array, n: Array, *,
-              parallel: bool | None) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Log evidence, and probabilities: of states (num_timesteps, num_states), of moves.
+@one_by_one
+def posterior(
+    x: Array, w: Array, initial: Array, final: Array, n: Array, parallel: bool | None
+) -> tuple[Array, Array, Array]:
+    """Log evidence, and probabilities of states (num_timesteps, num_states) and of moves.
 
-    The moves (num_timesteps - 1, num_bands, num_states) are as `w`, of staying too.
+    Moves (num_timesteps - 1, num_bands, num_states) are indexed as `w`, staying included.
     """
-
-    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> tuple[Array, Array, Array]:
-        before, taken = forward(x, w, initial, n, log_add, parallel)
-        states, moves = smooth(before, w, final, n, parallel)
-        return log_sum(row(before, n - 1) + final, 0) + taken, states, moves
-
-    return one_by_one(core, parallel)(x, w, initial, final, n)
+    before, taken = forward(x, w, initial, n, log_add, parallel)
+    states, moves = smooth(before, w, final, n, parallel)
+    return log_sum(row(before, n - 1) + final, 0) + taken, states, moves
 
 
 def probabilities(log_weights: Array, axis: int | tuple[int, ...]) -> Array:
-    """What is in proportion to the weights and sums to one along axes; zeros where all weights are."""
+    """Normalise weights along axes; zeros if all weights are zero."""
     weights = jnp.exp(log_weights - finite(log_weights.max(axis, keepdims=True)))
     total = weights.sum(axis, keepdims=True)
     return weights / jnp.maximum(total, 1.0)  # the largest weight is one, or all are zeros
 
 
-def evidence(x: Array, w: Array, initial: Array, final: Array, n: Array, *, parallel: bool | None) -> Array:
+@one_by_one
+def evidence(x: Array, w: Array, initial: Array, final: Array, n: Array, parallel: bool | None) -> Array:
     """Log of the summed weight of all paths."""
-
-    def core(x: Array, w: Array, initial: Array, final: Array, n: Array) -> Array:
-        table, taken = forward(x, w, initial, n, log_add, parallel)
-        return log_sum(row(table, n - 1) + final, 0) + taken
-
-    return one_by_one(core, parallel)(x, w, initial, final, n)
+    table, taken = forward(x, w, initial, n, log_add, parallel)
+    return log_sum(row(table, n - 1) + final, 0) + taken
 
 
 def draw(x: Array, w: Array, initial: Array, final: Array, n: Array, key: Array,
@@ -340,10 +337,10 @@ def draw(x: Array, w: Array, initial: Array, final: Array, n: Array, key: Array,
 
 
 def rank(x: Array, w: Array, initial: Array, final: Array, n: Array, count: int) -> tuple[Array, Array]:
-    """Starts (count, num_states) and log weights (count,) of the best paths; -inf where fewer are possible.
+    """Starts (count, num_states) and log weights (count,) of the best paths; -inf if there are fewer.
 
-    Every state keeps its `count` best histories, each by the jump that led to it and the rank of what it
-    continues.
+    Every state keeps its `count` best histories, each by the jump that led to it and the rank of its
+    predecessor.
     """
     (num_timesteps, num_states), num_bands = x.shape, w.shape[1]
     states = numbers(num_states)[None]

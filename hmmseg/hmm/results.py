@@ -1,4 +1,4 @@
-"""What the functions of hmmseg.hmm return: pytrees of NumPy arrays, of JAX arrays under jit and vmap."""
+"""Results of hmmseg.hmm's functions: pytrees of NumPy arrays, or of JAX arrays under jit and vmap."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from jax.tree_util import register_dataclass
 
 
 def crossings(moves: Sequence[Any]) -> Any:
-    """Probabilities that each boundary is crossed, from those of moves by one state, two, ..."""
+    """Probability that each boundary is crossed, given the probabilities of moves by one state, two, ..."""
     if len(moves) == 1:
         return moves[0]
     xp = np if isinstance(moves[0], np.ndarray) else importlib.import_module("jax.numpy")
     width, crossed = moves[0].shape[1], 0.0
     for d, band in enumerate(moves, 1):
-        for by in range(min(d, width)):  # a move by d states from k crosses the boundaries k to k + d - 1
+        for by in range(min(d, width)):  # a move by d states from k crosses boundaries k to k + d - 1
             crossed = crossed + xp.pad(band, ((0, 0), (by, width - by - band.shape[1])))
     return crossed
 
@@ -26,13 +26,13 @@ def crossings(moves: Sequence[Any]) -> Any:
 @register_dataclass
 @dataclass(frozen=True)
 class Alignment:
-    """One path through the states, by where each state starts.
+    """One path through the states, given by the start of each state.
 
     Attributes:
-        starts: (num_states,), first sample of each state; a state that is not visited starts where the
-            next one does (`num_samples` where none follows).
+        starts: (num_states,), first sample of each state; a state that is not visited starts where the next
+            one does (`num_samples` if none follows).
         num_samples: of the recording.
-        log_prob: the path's log weight; under jit -inf where there is no path.
+        log_prob: log weight of the path; under jit -inf if there is no path.
     """
 
     starts: Any
@@ -53,7 +53,7 @@ class Alignment:
 @register_dataclass
 @dataclass(frozen=True)
 class Alignments:
-    """Several paths; `alignments[i]` is one of them.
+    """Several paths; `alignments[i]` is an Alignment.
 
     Attributes:
         starts: (n, num_states), num_samples (n,), log_prob (n,), as in Alignment.
@@ -76,7 +76,7 @@ class Alignments:
 @register_dataclass
 @dataclass(frozen=True)
 class Filtered:
-    """On-line view.
+    """Filtered probabilities.
 
     Attributes:
         log_evidence: log of the summed weight of all complete paths.
@@ -94,8 +94,8 @@ class Posterior:
 
     Attributes:
         log_evidence: log of the summed weight of all paths.
-        smoothed: [t, k], state k at sample t.
-        moves: moves[d - 1] [t, k], from k to k + d between the samples t and t + 1.
+        smoothed: [t, k], of state k at sample t.
+        moves: moves[d - 1] [t, k], of moving from k to k + d between samples t and t + 1.
     """
 
     log_evidence: Any
@@ -106,38 +106,22 @@ class Posterior:
     def boundary(self) -> Any:
         """Probability [t, k] that states up to k end between t and t + 1 (num_samples - 1, num_states - 1).
 
-        Who passes over states crosses all their boundaries at once.
+        A path that skips states crosses all their boundaries at once.
         """
         return crossings(self.moves)
 
-    def start_quantiles(self, q: float) -> np.ndarray:
-        """Quantile of the first sample of the states 1, 2, ... (num_states - 1,), given that they start.
-
-        NaN for a boundary that the posterior never crosses.
-        """
-        return self._quantiles(q)[:, 0]
-
     def start_intervals(self, level: float = 0.9) -> np.ndarray:
-        """Central credible interval [samples] of each boundary, as its first sample (num_states - 1, 2)."""
-        return self._quantiles((1 - level) / 2, (1 + level) / 2)
+        """Central credible intervals (num_states - 1, 2) of the first sample of states 1, 2, ...
 
-    def _quantiles(self, *levels: float) -> np.ndarray:
-        boundary = np.asarray(self.boundary)
-        found = np.full((boundary.shape[1], len(levels)), np.nan)
+        Given that the state starts; NaN for a boundary that the posterior never crosses.
+        """
+        boundary, quantiles = np.asarray(self.boundary), np.array([1 - level, 1 + level]) / 2
+        intervals = np.full((boundary.shape[1], 2), np.nan)
         for k, probability in enumerate(boundary.T):
             cumulative = np.cumsum(probability)
             if cumulative.size and cumulative[-1] > 0:
-                found[k] = 1.0 + np.searchsorted(cumulative, np.array(levels) * cumulative[-1])
-        return found
-
-    def confidence(self, alignment: Alignment, within: int = 0) -> np.ndarray:
-        """Probability (num_states - 1,) that each boundary of an alignment is right to `within` samples."""
-        cumulative = np.pad(np.cumsum(self.boundary, axis=0), ((1, 0), (0, 0)))
-        at = alignment.starts[1:] - 1  # the interval between two samples in which the boundary lies
-        low = np.clip(at - within, 0, len(cumulative) - 1)
-        high = np.clip(at + within + 1, 0, len(cumulative) - 1)
-        k = np.arange(cumulative.shape[1])
-        return cumulative[high, k] - cumulative[low, k]
+                intervals[k] = 1.0 + np.searchsorted(cumulative, quantiles * cumulative[-1])
+        return intervals
 
 
 @register_dataclass
@@ -146,7 +130,7 @@ class AlignmentPosterior(Posterior):
     """A posterior with its most probable path.
 
     Attributes:
-        path: (num_samples,), the states of the most probable path.
+        path: (num_samples,), states of the most probable path.
         log_prob: its log weight.
     """
 

@@ -1,14 +1,13 @@
-"""The same posterior while samples arrive: filtered at once, smoothed after a fixed lag.
+"""The posterior of a stream: filtered at once, smoothed after a fixed lag.
 
-Memory and time a sample are O(num_states lag), however long the stream is: a sample is one call of a program.
+Memory and time per sample are O(num_states lag), however long the stream is; each sample is one call of a
+compiled program.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,14 +23,14 @@ from hmmseg.hmm.results import crossings
 
 @dataclass(frozen=True)
 class Step:
-    """What one more sample says.
+    """Posterior after one more sample.
 
     Attributes:
         sample: its number.
         filtered: (num_states,), probability of each state at it.
         log_evidence: log weight of all paths so far, wherever they are.
-        smoothed: (num_states,), of the sample `lag` earlier, given all so far; None while there is none.
-        boundary: (num_states - 1,), the probability that states up to k ended right before that sample.
+        smoothed: (num_states,), probability of each state `lag` samples earlier; None for the first samples.
+        boundary: (num_states - 1,), probability that states up to k ended right before that sample.
     """
 
     sample: int
@@ -43,13 +42,13 @@ class Step:
 
 @dataclass(frozen=True)
 class Window:
-    """Samples `first`, first + 1, ... given all that has come.
+    """Samples `first`, first + 1, ... given everything received.
 
     Attributes:
-        first: number of the first of them.
+        first: number of the first sample.
         smoothed: (n, num_states).
-        boundary: (n, num_states - 1), the probability that states up to k ended right before each sample
-            (zeros for sample 0).
+        boundary: (n, num_states - 1), probability that states up to k ended right before each sample (zeros
+            for sample 0).
     """
 
     first: int
@@ -58,12 +57,12 @@ class Window:
 
 
 class StreamingFilter:
-    """Follows a stream through a chain whose weights do not vary in time.
+    """Follows a stream through a chain with constant weights.
 
     Args:
-        chain: without tables of durations, which would need the whole stream.
-        lag: samples; how long a sample is waited for before it is smoothed (0: not at all). Boundary
-            posteriors summed over time are those of fixed-lag smoothing.
+        chain: without duration tables, which would need the whole stream.
+        lag: samples by which smoothing is delayed (0: no smoothing). Boundary posteriors summed over time are
+            those of fixed-lag smoothing.
 
     Raises:
         ValueError: a chain that varies in time, a negative lag.
@@ -81,15 +80,15 @@ class StreamingFilter:
         self.chain, self.lag = chain, lag
         self.num_samples = 0
         self._w = chain.by_target()
-        # Of the last lag + 2 samples, the newest last: log probability of each state given those so far.
+        # Log filtered probabilities of the last lag + 2 samples, the newest last.
         self._before = np.full((lag + 2, chain.num_states), -np.inf)
         self._log_evidence = 0.0
 
     def update(self, log_likelihood: ArrayLike) -> Step:
-        """One sample's log-likelihoods (num_states,); NaN throughout: a missing sample.
+        """Process one sample's log-likelihoods (num_states,); NaN throughout: a missing sample.
 
-        Raises InfeasibleAlignment where no state is possible any more, ValueError for NaN beside numbers
-        and for +inf; the stream then is as if the sample had not come.
+        Raises InfeasibleAlignment if no state remains possible, ValueError for NaN beside numbers and for
+        +inf; the stream is then unchanged.
         """
         row, k = np.asarray(log_likelihood, dtype=np.float64), self.chain.num_states
         if row.shape != (k,):
@@ -102,9 +101,7 @@ class StreamingFilter:
             )
         first = np.asarray(self.chain.log_initial) if self.num_samples == 0 else np.full(k, -np.inf)
         with jax.enable_x64(True):
-            before, gained, *smoothed = jax.tree.map(
-                np.asarray, _compiled(_updated)(self._before, self._w, first, row)
-            )
+            before, gained, *smoothed = jax.tree.map(np.asarray, _update(self._before, self._w, first, row))
         if not math.isfinite(gained):
             reached = np.flatnonzero(np.isfinite(self._before[-1])).max(initial=-1)
             raise InfeasibleAlignment(
@@ -117,13 +114,13 @@ class StreamingFilter:
         return Step(sample, np.exp(before[-1]), self._log_evidence, *late)
 
     def window(self) -> Window:
-        """The last lag + 1 samples, given all that has come and without knowing whether more will."""
+        """The last lag + 1 samples given everything received, whether or not more follows."""
         return self._window(self.lag + 1, np.zeros(self.chain.num_states))
 
     def finish(self) -> Window:
-        """The samples that no step has smoothed, given the whole stream and where the chain has to end.
+        """The samples that no step has smoothed, given the whole stream and the final weights of the chain.
 
-        Raises InfeasibleAlignment where it cannot have ended there.
+        Raises InfeasibleAlignment if the chain cannot end there.
         """
         return self._window(self.lag, np.asarray(self.chain.log_final))
 
@@ -134,19 +131,21 @@ class StreamingFilter:
             raise InfeasibleAlignment(self.chain.num_states - 1, "reached, but cannot be held to the end")
         num = min(most, self.num_samples)
         with jax.enable_x64(True):
-            smoothed, boundary = map(np.asarray, _compiled(_smoothed)(self._before, self._w, final))
+            smoothed, boundary = map(np.asarray, _smooth(self._before, self._w, final))
         at = len(smoothed) - num
         return Window(self.num_samples - num, smoothed[at:], boundary[at - 1 : len(boundary)])
 
 
-def _smoothed(before: Array, w: Array, final: Array) -> tuple[Array, Array]:
+@jax.jit
+def _smooth(before: Array, w: Array, final: Array) -> tuple[Array, Array]:
     """Probabilities of the window's states, and of the boundaries between its samples."""
     states, moves = smooth(before, w, final, jnp.int32(len(before)), False)
     return states, crossings([moves[:, d, d:] for d in range(1, w.shape[1])])
 
 
-def _updated(before: Array, w: Array, first: Array, row: Array) -> tuple[Array, ...]:
-    """The window with one more sample, what it adds to the log evidence, and what is smoothed then."""
+@jax.jit
+def _update(before: Array, w: Array, first: Array, row: Array) -> tuple[Array, ...]:
+    """The window after one more sample, the gain in log evidence, and the smoothed window."""
     now = first
     for d in range(w.shape[1]):
         now = log_add(now, forwards(before[-1], d) + w[0, d])
@@ -154,9 +153,4 @@ def _updated(before: Array, w: Array, first: Array, row: Array) -> tuple[Array, 
     gained = log_sum(now, 0)
     now = now - jnp.where(jnp.isfinite(gained), gained, 0.0)
     before = jnp.concatenate([before[1:], now[None]])
-    return before, gained, *_smoothed(before, w, jnp.zeros(len(row)))
-
-
-@cache
-def _compiled(core: Any) -> Any:
-    return jax.jit(core)
+    return before, gained, *_smooth(before, w, jnp.zeros(len(row)))

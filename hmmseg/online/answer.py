@@ -6,8 +6,6 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hmmseg.contact.decompose import FREE, UNITS, Subtask
 from hmmseg.segmentation.spans import Span
 
@@ -19,7 +17,7 @@ Z90, Z95 = 1.6448536269514722, 1.959963984540054  # physics: normal quantiles of
 
 @dataclass(frozen=True)
 class Crossing:
-    """A settled boundary: the subtask that it begins, of which round (from 0), when and how surely [s]."""
+    """A settled boundary: the subtask that begins, its round (from 0), and its time with sd [s]."""
 
     step: Subtask
     round: int
@@ -28,47 +26,42 @@ class Crossing:
 
 
 class Answer:
-    """What a watcher knows at one row.
+    """State of a watcher after one row; read it before the next row.
 
     `t` [s]; `probabilities` (num_subtasks,) of the subtasks of one round; `departed`: probability that the
-    recording has left its task; `smoothed`: as `probabilities`, of the time t - lag; `properties`:
-    (object, property, mean, sd). Read it before the next row.
+    recording has left its task; `smoothed`: as `probabilities`, at time t - lag; `properties`: (object,
+    property, mean, sd).
     """
 
-    note: str | None  # what was irregular about the row, in words
+    note: str | None = None  # irregularity of the row, in words
 
-    def __init__(self, watcher: Filter, t: float, now: np.ndarray, smoothed: np.ndarray, means: np.ndarray,
-                 round_: int, departed: tuple[int, float, int], final: bool) -> None:  # fmt: skip
-        self._watcher, self.t, self.final, self.round = watcher, t, final, round_
-        self.probabilities, self.departed = now[:-1], float(now[-1])
-        self.smoothed, self._means = smoothed[:-1], means
-        self._missed, self._left_at, state = departed
-        self._off, self.note = watcher.off_task[max(state, 0)], None
+    def __init__(self, watcher: Filter, t: float, final: bool) -> None:
+        self._watcher, self.t, self.final, self.round = watcher, t, final, watcher.round
+        self.probabilities, self.departed = watcher.now[:-1], float(watcher.now[-1])
+        self.smoothed = watcher.smoothed[:-1]
+        self._missed, self._left_at, state = watcher.departure
+        self._contact = watcher.off_task[max(state, 0)]
         self.index = int(self.probabilities.argmax())
         if self.departed > 0.5:
             self.index = self._missed
 
     @property
     def fits(self) -> bool:
-        """Whether the recording more likely than not follows its task; at its end, whether it is complete."""
-        if self.departed > 0.5:
-            return False
-        return not self.final or self._at_end
-
-    @property
-    def _at_end(self) -> bool:
+        """Whether the recording probably follows its task; at the end, whether it is complete."""
         w = self._watcher
-        last = self.index == w.num_steps - 1
-        return last and (w.task.repeat == "unknown" or self.round + 1 == w.num_rounds)  # type: ignore[union-attr]
+        if self.departed > 0.5 or not self.final:
+            return self.departed <= 0.5
+        last_round = w.task.repeat == "unknown" or self.round + 1 == w.num_rounds
+        return last_round and self.index == w.num_steps - 1
 
     @property
     def subtask(self) -> Subtask:
-        """The most probable subtask; where the recording has left its task, the one it misses."""
+        """The most probable subtask; after a departure, the one that is missing."""
         return self._watcher.steps[self.index]
 
     @property
     def next(self) -> Subtask | None:
-        """What the task has next; None at its end and off it."""
+        """The task's next subtask; None at its end and after a departure."""
         w = self._watcher
         if self.departed > 0.5:
             return None
@@ -78,29 +71,29 @@ class Answer:
 
     @property
     def properties(self) -> list[tuple[str, str, float, float]]:
-        """(object, property, mean, sd) of what is known so far, SI units."""
-        return self._watcher.properties.table(self._means)
+        """(object, property, mean, sd) of the properties known so far, SI units."""
+        return self._watcher.properties.table(self._watcher.means)
 
     @property
     def failed(self) -> dict[str, Any] | None:
-        """Which subtask the recording does not show, as in `segment`; None while it fits."""
+        """The subtask that the recording does not show, as in `segment`; None while it fits."""
         if self.fits:
             return None
         w = self._watcher
         if self.departed > 0.5:
-            state, block = self._off
-            held = state if state == FREE else f"{state} of {block or 'another block'}"
-            step, reason = w.steps[self._missed], f"{held} from {self._left_at:.2f} s on"
+            state, block = self._contact
+            shown = state if state == FREE else f"{state} of {block or 'another block'}"
+            step, reason = w.steps[self._missed], f"{shown} from {self._left_at:.2f} s on"
         else:
             k = min(self.index + 1, w.num_steps - 1)
             step, reason = w.steps[k], f"the recording ends in {self.subtask.name}"
         return {"index": step.index, "subtask": step.name, "object": step.object, "reason": reason}
 
     def line(self, more: dict[str, Any] | None = None) -> str:
-        """One line of JSON, without its newline; `more`: further entries of the last one."""
+        """One line of JSON, without its newline; `more`: further entries of the final line."""
         step = self.subtask
         w = self._watcher
-        state = step.state if self.departed <= 0.5 else self._off[0]
+        state = step.state if self.departed <= 0.5 else self._contact[0]
         probabilities = ["0" if p < 5e-7 else f"{p:.6f}" for p in self.probabilities.tolist()]
         parts = [
             f'{{"t":{self.t:.9g},"subtask":{_name(step.name)},"object":{_name(step.object)},"state":"{state}"',
@@ -141,13 +134,12 @@ class Answer:
     def segments(self) -> list[dict[str, Any]]:
         """The spans so far, as in `segment`; the last one ends at this row."""
         w = self._watcher
-        first = w.first_t
-        edges = [(first, 0.0), *((c.t, c.sd) for c in w.crossings), (self.t, 0.0)]
+        edges = [(w.first_t, 0.0), *((c.t, c.sd) for c in w.crossings), (self.t, 0.0)]
         out, steps = [], [w.steps[0], *(c.step for c in w.crossings)]
         for step, (start, sd), (end, end_sd) in zip(steps, edges, edges[1:], strict=False):
             end = max(start, end)
-            own, after = ((t - Z90 * s, t + Z90 * s) for t, s in ((start, sd), (end, end_sd)))
-            span = Span(step.name, step.object, step.state, start, end, sd, end_sd, own, after)
+            start_90, end_90 = ((t - Z90 * s, t + Z90 * s) for t, s in ((start, sd), (end, end_sd)))
+            span = Span(step.name, step.object, step.state, start, end, sd, end_sd, start_90, end_90)
             out.append(span.to_json())
         return out
 

@@ -1,7 +1,7 @@
-"""How what runs once for every reading is compiled: by numba, kept in the user's cache folder.
+"""Compilation, by numba, of the code that runs once for every reading; cached in the user's cache folder.
 
-A reading is a few thousand scalar steps with branches. As a jitted JAX function it would cost a call for
-each reading, and an empty call with the table of hypotheses takes about as long as a whole reading here.
+A reading takes a few thousand scalar steps with branches. A jitted JAX function would need a call per
+reading, and an empty call with the table of hypotheses already takes about as long as a whole reading here.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from hmmseg.contact import equations
 
 try:
     from numba.core.caching import IndexDataCacheFile
-except ImportError:  # another numba than those that this was tried with keeps its files itself
+except ImportError:  # untested versions of numba manage their files themselves
     IndexDataCacheFile: Any = object
 
 HOME, SHARED = cache_folder(), (densities, levels, equations)
 if HOME is not None and not numba.config.CACHE_DIR:  # type: ignore[attr-defined]
-    # Numba notices a change of a function's own file alone: a folder for each state of these files.
+    # Numba detects changes of a function's own file only, so each state of these files has its own folder.
     sources = [*Path(__file__).parent.glob("*.py"), *(Path(str(m.__file__)) for m in SHARED)]
     state = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources))).hexdigest()[:16]
     keep(HOME / "numba" / state / "writable", b"")
@@ -40,7 +40,7 @@ CACHED = bool(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
 
 
 class _Kept(IndexDataCacheFile):
-    """A function's programs as files that say themselves whether they are whole: numba runs what it finds."""
+    """Cache files of a function that carry a checksum, as numba would run damaged ones."""
 
     def _load_index(self) -> dict[Any, str]:
         content = kept(Path(self._index_path))
@@ -53,7 +53,7 @@ class _Kept(IndexDataCacheFile):
     def _load_data(self, name: str) -> Any:
         content = kept(Path(self._data_path(name)))
         if content is None:
-            raise OSError(name)  # by which numba knows that it is to compile
+            raise OSError(name)  # tells numba to compile
         return pickle.loads(content)
 
     def _save_data(self, name: str, data: Any) -> None:
@@ -61,8 +61,8 @@ class _Kept(IndexDataCacheFile):
 
 
 def compiled(function: Callable) -> Any:
-    """`function` compiled at its first call, without the interpreter's lock."""
-    function = inspect.unwrap(function)  # checkers of annotations wrap every function when tests run
+    """Compile `function` at its first call, without the interpreter's lock."""
+    function = inspect.unwrap(function)  # annotation checkers wrap every function in tests
     made: Any = numba.njit(function, cache=CACHED, **OPTIONS)
     if CACHED:
         with contextlib.suppress(AttributeError, TypeError):
@@ -71,7 +71,7 @@ def compiled(function: Callable) -> Any:
 
 
 def _for_numbers(function: Callable) -> None:
-    """Let compiled functions call for single numbers what other packages compute of arrays."""
+    """Let compiled functions call, for single numbers, functions that other packages apply to arrays."""
     plain = inspect.unwrap(function)
     options: Any = OPTIONS
     overload(function, jit_options=options, strict=False)(lambda *_, **__: plain)

@@ -1,12 +1,12 @@
-"""The filter of a block task: one row after another, nothing looked ahead beyond the lag.
+"""The filter of a block task: processes one row after another, without looking ahead beyond the lag.
 
-The filter is over alignments with the blocks' unknown weights and widths: hypotheses that differ by when
-each subtask began carry conjugate posteriors of everything else (a Rao-Blackwellised filter that
-enumerates where a particle filter draws; Adams and MacKay 2007; Doucet et al. 2000). docs/watch.md.
+It filters alignments jointly with the blocks' unknown weights and widths: hypotheses that differ by the start
+of each subtask carry conjugate posteriors of everything else (a Rao-Blackwellised filter that enumerates
+instead of drawing particles; Adams and MacKay 2007; Doucet et al. 2000). docs/watch.md.
 
-The filter knows a boundary to a sample of its own pace; where a block is lifted, or samples are far apart,
-the contact equations say more: the alignment of the two subtasks alone, with the crossing between samples
-(hmmseg.segmentation.boundaries), under the parameters that the filter has learned.
+The filter resolves a boundary to one of its samples. Where a block is lifted, or samples are sparse, the
+contact equations refine it: the two subtasks are aligned alone, with the crossing between samples
+(hmmseg.segmentation.boundaries), under the parameters learned by the filter.
 """
 
 from __future__ import annotations
@@ -68,26 +68,25 @@ from hmmseg.segmentation.pads import sense
 from hmmseg.segmentation.posteriors import contacts, nearest_touch
 from hmmseg.segmentation.rounds import one_round, round_tasks
 
-WARM_UP = 8  # numerics: rows that determine a force noise which the rig does not state
+WARM_UP = 8  # numerics: rows from which a force noise that the rig does not state is estimated
 NUM_CHANNELS = len(CARTESIAN_CHANNELS)
 KINDS = {FREE: FREE_KIND, ON_GROUND: GROUND_KIND, SLIDING: SLIDING_KIND, ABOVE_GROUND: ABOVE_KIND}
-# chosen: where scales start, before the recording says better [m/s, m, m]; worth PRIOR readings. Chosen: a
-# hand at rest creeps, and pads' foam gives by tenths of a mm.
+# chosen: initial scales [m/s, m, m]: a hand at rest creeps, and pads' foam gives by tenths of a mm
 VELOCITY, LEVEL, WIDTH = CREEP, 2e-4, 2e-4
-PRIOR = 4.0  # prior: readings that a scale's start is worth
-# prior: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; of no more weight than a few nats
+PRIOR = 4.0  # prior: readings that an initial scale is worth
+# prior: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; worth a few nats at most
 LEAST_SPANS = (0.1, 0.1, 0.03, 0.03)
-LEAST_FORCE = 50.0  # prior: and of its forces, in sds of their noise
-ROUGH = 3.0  # prior: net and shear force of a held block at first, in sds of the force noise
-UNBIASED = 10.0  # prior: a sensor's bias before anything is known, in sds of its noise
+LEAST_FORCE = 50.0  # prior: initial range of its forces, in sds of their noise
+ROUGH = 3.0  # prior: initial scale of a held block's net and shear force, in sds of the force noise
+UNBIASED = 10.0  # prior: initial sd of a sensor's bias, in sds of its noise
 NEAREST = round(DRIFTS * MAX_RATE)  # samples of a hold that locate the block next to a contact change
-REACH = 0.6  # chosen: s before a boundary: what is read of the subtask that it ends
+REACH = 0.6  # chosen: s of the subtask before a boundary that refine it
 FINE = 100.0  # numerics: Hz; in faster recordings the filter itself places touches
 
 
 @dataclass
 class _State:
-    """All that changes from row to row; copied whole, it is a point to return to."""
+    """Everything that changes from row to row; a copy is a point to return to."""
 
     rows: np.ndarray
     known: np.ndarray
@@ -106,13 +105,13 @@ class _State:
 
 
 class Filter:
-    """Follows one performance of a task of blocks, its rows in order of time (see Watcher)."""
+    """Follows one performance of a block task, given its rows in order of time (see Watcher)."""
 
     def __init__(self, task: BlockTask, rig: Rig, lag: float) -> None:
         self.task, self.rig, self.lag = task, rig, lag
         self.channels = JOINT_CHANNELS if rig.jointed else CARTESIAN_CHANNELS
         self.optional = () if rig.jointed else CARTESIAN_OPTIONAL
-        self.rows: deque[tuple[float, np.ndarray]] = deque()  # the last, over the lag and REACH before it
+        self.rows: deque[tuple[float, np.ndarray]] = deque()  # of the last lag + REACH seconds
         self._prepare_task(task)
         noise = rig.noise
         position = noise.angle if rig.jointed else noise.position
@@ -123,8 +122,8 @@ class Filter:
         self._written, self._written_t = "{}", -math.inf
         self.crossings: list[Crossing] = []
         self.first_t = math.nan  # of the first row [s]
-        self.touches: list[tuple[float, float]] = []  # known apart from forces [s]
-        self.together = 1.0 / MAX_RATE  # readings nearer to each other than this are no two [s]
+        self.touches: list[tuple[float, float]] = []  # times and sds of touches known apart from forces [s]
+        self.together = 1.0 / MAX_RATE  # readings closer than this are not independent [s]
         self._waiting: list[tuple[float, np.ndarray]] = []
         self._velocities = True
         num_quantities = 2 * (len(task.objects) + 1) + len(task.moves)
@@ -135,9 +134,10 @@ class Filter:
         )
         self._x = np.full(1, np.nan).astype(READING)
         self._x["sd_fx"], self._x["sd_fy"], self._x["gripped"] = 0.0, 0.0, 1.0
-        self._now, self._smoothed = np.zeros((2, self.num_steps + 1))
-        self._means = np.zeros((2 * len(task.objects) + len(task.moves), 3))
-        self._least, self._round, self._departed = np.array(LEAST_SPANS), 0, (0, 0.0, 0)
+        self.now, self.smoothed = np.zeros((2, self.num_steps + 1))  # as `summarise` fills them
+        self.means = np.zeros((2 * len(task.objects) + len(task.moves), 3))
+        # The heaviest hypotheses: round of the one on the task; missed subtask, time [s] and state off it.
+        self._least, self.round, self.departure = np.array(LEAST_SPANS), 0, (0, 0.0, 0)
         self._state = _State(
             *self._table, 0, np.full(ROWS, np.nan).astype(ROW), np.array([[np.inf, -np.inf]] * 4),
             np.array([(*LEAST_SPANS, 1.0, 1.0)], RANGES), np.zeros(12),
@@ -162,7 +162,7 @@ class Filter:
         self._chain = np.array(states), self.properties.signs, self.num_steps, len(names), repeats
 
     def _begin(self, noise: float) -> None:
-        """The one hypothesis to start from, and those of a recording that starts off its task."""
+        """Create the initial hypothesis, and those of a recording that starts off its task."""
         s = self._state
         h = np.zeros(1, HYPOTHESIS)
         h["missed"], h["left_at"], h["entered"][:, 0] = -1, math.inf, s.last_t
@@ -174,16 +174,16 @@ class Filter:
         h["scale"][0] = np.stack([PRIOR * starts**2, np.full(starts.size, PRIOR)], axis=1)
         off = len(self.off_task)
         s.rows[:off], s.known[:off] = h, 0.0
-        away = s.rows[1:off]  # whatever is free motion at the start is the task's own
+        away = s.rows[1:off]  # initial free motion always belongs to the task
         away["state"], away["missed"] = self.num_steps + np.arange(1, off), 0
         away["left_at"], away["weight"] = s.last_t, LOG_DEPARTURE - math.log(off)
         s.count, s.started = off, True
         s.ranges["force"] = s.ranges["press"] = LEAST_FORCE * noise
 
     def take(self, t: float, row: np.ndarray) -> None:
-        """One row (12,) in SI units, NaN where missing, at a time after all before.
+        """Process one row (12,) in SI units, NaN where missing, later than all before.
 
-        Of a wrist's sensor (16,): what `hmmseg.online.wrist.Wrist` adds.
+        For a wrist's sensor (16,), with what `hmmseg.online.wrist.Wrist` adds.
         """
         self.rows.append((t, row))
         while self.rows[0][0] < t - self.lag - REACH:
@@ -216,7 +216,7 @@ class Filter:
         self._settle(t - self.lag)
 
     def idle(self, t: float) -> None:
-        """Time goes on, though no row can be read yet."""
+        """Advance the time while no row can be read yet."""
         self.first_t = t if math.isnan(self.first_t) else self.first_t
         if not self._state.started:
             self._state.last_t = t
@@ -243,9 +243,9 @@ class Filter:
             self._take(each_t, each)
 
     def _settle(self, before: float) -> None:
-        """Boundaries that are now older than the lag, each once."""
+        """Settle boundaries that are now older than the lag, each once."""
         s = self._state
-        while self._now[-1] < 0.5:  # off the task nothing is a boundary of it
+        while self.now[-1] < 0.5:  # nothing off the task is a boundary of it
             mean, variance, come, early = boundary(s.rows, s.count, self.num_steps, s.settled, before)
             if early < 0.5 or come <= 0:
                 return
@@ -253,52 +253,49 @@ class Filter:
             del self.crossings[number:]
             ended, begun = (self.steps[(n - 1) % per_round + 1 if n else 0] for n in (number, number + 1))
             previous = self.crossings[-1].t if number else -math.inf
-            found = self._refined(ended, begun, previous, mean, sd)
-            self.crossings.append(Crossing(begun, number // per_round, *(found or (mean, sd))))
+            refined = self._refined(ended, begun, previous, mean, sd)
+            self.crossings.append(Crossing(begun, number // per_round, *(refined or (mean, sd))))
             s.settled += 1
 
     def _refined(
         self, before: Subtask, after: Subtask, previous: float, mean: float, sd: float
     ) -> tuple[float, float] | None:
-        """Median and sd [s] of a boundary that the filter places at `mean`; None where the rows say no more.
+        """Refine a boundary that the filter places at `mean`: median and sd [s]; None if the rows cannot.
 
         `previous` [s]: the boundary before.
         """
         if self.rig.gripper is not None and FREE in (before.state, after.state):
-            known = nearest_touch(tuple(self.touches), normal(mean, sd))
-            return known.quantile(0.5), known.sd
+            boundary_posterior = nearest_touch(tuple(self.touches), normal(mean, sd))
+            return boundary_posterior.quantile(0.5), boundary_posterior.sd
         touch = before.state == FREE or after.name == "place"
         start = max(mean - REACH, previous)
         rows = [each for each in self.rows if start <= each[0] <= mean + max(self.lag, REACH)]
-        if len(rows) < 2 * NEAREST or self._now[-1] > 0.5:
+        if len(rows) < 2 * NEAREST or self.now[-1] > 0.5:
             return None
         t = np.array([each[0] for each in rows])
         if touch and 1.0 / np.median(np.diff(t)) > FINE:
             return None
         table = np.array([each[1] for each in rows])
-        there = {name: table[:, k] for k, name in enumerate(self.channels) if not np.isnan(table[:, k]).all()}
-        if set(self.channels) - set(there) - set(self.optional):
+        recorded = {name: c for name, c in zip(self.channels, table.T, strict=False) if not np.isnan(c).all()}
+        if set(self.channels) - set(recorded) - set(self.optional):
             return None
         timing = table[:, NUM_CHANNELS] if self.rig.gripper is not None else None
-        trial = Trial("stream", t, there, timing=timing)
+        trial = Trial("stream", t, recorded, timing=timing)
         signals = thin(task_space(trial, self.rig), MAX_RATE, WINDOW)
         if signals.t.size < NEAREST:
             return None
-        parameters = self._parameters()
-        found = features(signals, self.rig)
+        parameters, f = self._parameters(), features(signals, self.rig)
         steps = (replace(before, index=0), replace(after, index=1))
-        levels = {}
-        for step in steps:
-            side = signals.t < mean if step.index == 0 else signals.t > mean
-            if step.state in (ON_GROUND, SLIDING) and side.any():
-                near = found.block_y(parameters.bias)[side]
-                near = near[-NEAREST:] if step.index == 0 else near[:NEAREST]
-                if np.isfinite(near).any():
-                    levels[step.index] = float(np.nanmedian(near))
+        levels, height = {}, f.block_y(parameters.bias)
+        for step, near in zip(
+            steps, (height[f.t < mean][-NEAREST:], height[f.t > mean][:NEAREST]), strict=True
+        ):
+            if step.state in (ON_GROUND, SLIDING) and np.isfinite(near).any():
+                levels[step.index] = float(np.nanmedian(near))
         parameters = replace(parameters, levels=(levels,))
         chain = left_to_right([signals.t.size / 2] * 2)
         try:
-            posterior = smooth(log_likelihoods(found, steps, parameters, 0), chain)
+            posterior = smooth(log_likelihoods(f, steps, parameters, 0), chain)
         except ValueError:
             return None
         probability = posterior.boundary[:, 0]
@@ -309,11 +306,11 @@ class Filter:
         out = evenly(t, probability) if change is None else moment(change)
         median = out.quantile(0.5)
         if not math.isfinite(median) or abs(median - mean) > 3 * sd + 2 / MAX_RATE:
-            return None  # another event than the filter's
+            return None  # not the filter's event
         return median, out.sd
 
     def _parameters(self) -> Parameters:
-        """What the heaviest hypothesis has learned, under the names of the segmentation off line."""
+        """Parameters learned by the heaviest hypothesis, named as in hmmseg.segmentation.emissions."""
         s = self._state
         best = int(s.rows["weight"][: s.count].argmax())
         h, known = s.rows[best], s.known[best]
@@ -328,32 +325,30 @@ class Filter:
         return Parameters(h["bias"][:, 0] / h["bias"][:, 1], weight, scale, width)
 
     def properties_text(self, answer: Answer) -> str:
-        """The properties as JSON, written anew once an independent reading, as they change no faster."""
+        """The properties as JSON, rewritten once per independent reading, as they change no faster."""
         if answer.final or not answer.t < self._written_t + 1 / MAX_RATE:
             self._written, self._written_t = answer.properties_json(), answer.t
         return self._written
 
     def answer(self, final: bool = False) -> Answer:
-        """What is known now."""
+        """The current answer."""
         s = self._state
         if not s.started:
-            self._now[:], self._smoothed[:], self._means[:] = 0.0, 0.0, 0.0
-            self._now[0] = self._smoothed[0] = 1.0
+            self.now[:], self.smoothed[:], self.means[:] = 0.0, 0.0, 0.0
+            self.now[0] = self.smoothed[0] = 1.0
         else:
             blocks, before = len(self.task.objects), s.last_t - self.lag
-            on, off = summarise(s.rows, s.known, s.count, self.num_steps, blocks, before, self._now,
-                                self._smoothed, self._means)  # fmt: skip
+            on, off = summarise(s.rows, s.known, s.count, self.num_steps, blocks, before, self.now,
+                                self.smoothed, self.means)  # fmt: skip
             if on >= 0:
-                self._round = int(s.rows["round"][on])
+                self.round = int(s.rows["round"][on])
             if off >= 0:
                 missed, left_at, state = (s.rows[name][off].item() for name in ("missed", "left_at", "state"))
-                self._departed = missed, left_at, state - self.num_steps
-        return Answer(
-            self, s.last_t, self._now, self._smoothed, self._means, self._round, self._departed, final
-        )
+                self.departure = missed, left_at, state - self.num_steps
+        return Answer(self, s.last_t, final)
 
     def finish(self) -> Answer:
-        """The last answer: every boundary that has come is settled, whatever its age."""
+        """The final answer, with all boundaries settled whatever their age."""
         s = self._state
         if not s.started and self._waiting:
             self.force_noise = self.force_noise or 0.01
@@ -365,20 +360,20 @@ class Filter:
         return self.answer(final=True)
 
     def snapshot(self) -> Any:
-        """All that changes, to return to with `restore`."""
+        """Everything that changes, for `restore`."""
         s = self._state
-        # Named arrays copy slowly.
+        # Structured arrays are slow to copy.
         big = s.rows[: s.count].tobytes(), s.known[: s.count].copy(), s.ring.tobytes()
         small = copy.copy(s), s.extremes.copy(), s.ranges.copy()
-        return small, big, len(self.crossings), list(self._waiting), self._now.copy()
+        return small, big, len(self.crossings), list(self._waiting), self.now.copy()
 
     def restore(self, snapshot: Any) -> list[tuple[float, np.ndarray]]:
-        """Return to an earlier point; the rows taken since."""
+        """Return to an earlier point; returns the rows taken since."""
         (state, extremes, ranges), (rows, known, ring), crossings, waiting, now = snapshot
         self._state = s = copy.copy(state)
         s.rows[: s.count], s.known[: s.count] = np.frombuffer(rows, HYPOTHESIS), known
         s.ring, s.extremes, s.ranges = np.frombuffer(ring, ROW).copy(), extremes.copy(), ranges.copy()
-        self._waiting, self._now[:] = list(waiting), now
+        self._waiting, self.now[:] = list(waiting), now
         del self.crossings[crossings:]
         since = [each for each in self.rows if each[0] > state.last_t]
         for _ in since:
@@ -387,10 +382,10 @@ class Filter:
 
 
 class Properties:
-    """What the means of weights, widths and rises say of every block, with errors that all rows share.
+    """Properties of every block from the means of weights, widths and rises, with errors common to all rows.
 
-    `steady` (num_moves,): whether a move rises by the same heights in every round; `signs` (num_moves,):
-    which way it goes where that is known, 0 elsewhere.
+    `steady` (num_moves,): whether a move has the same height equation in every round; `signs` (num_moves,):
+    direction of its rise where known, otherwise 0.
     """
 
     def __init__(self, task: BlockTask, rounds: Sequence[BlockTask], rig: Rig) -> None:
@@ -407,13 +402,13 @@ class Properties:
                     self.signs[move] = np.sign(next(iter(rise.values())))
         gain = np.array(rig.systematic.force_gain)
         self.weight_gain = float(np.hypot(gain[1], gain[3]) / 2)  # half of it on each finger
-        self.touch_sd = 0.0  # how well the distance at which fingers touch is known, in all grips alike [m]
-        self.force_sd = 0.0  # how well the zero of the net force is known, in all grips alike [N]
+        self.touch_sd = 0.0  # common error of all grips in the distance at which fingers touch [m]
+        self.force_sd = 0.0  # common error of all grips in the zero of the net force [N]
         self._seen: bytes = b""
         self._heights: list[tuple[str, str, float, float]] = []
 
     def table(self, means: np.ndarray) -> list[tuple[str, str, float, float]]:
-        """(object, property, mean, sd) of what is known more likely than not."""
+        """(object, property, mean, sd) of the properties that are known with a probability above 0.5."""
         out = []
         for o, name in enumerate(self.objects):
             (weight, of_weight, weighed), (width, of_width, seen) = means[2 * o : 2 * o + 2].tolist()

@@ -1,7 +1,7 @@
-"""One reading through all hypotheses: who moves on, how well each explains it, which are kept, what all say.
+"""Processing of one reading by all hypotheses: transitions, weights, learning, merging, and summaries.
 
-Hypotheses of one state differ by when they entered it, so that how long a state has lasted is known exactly;
-what is alike is merged by its moments.
+Hypotheses of one state differ by the time at which they entered it, so the duration of a state is known
+exactly; similar ones are merged by their moments.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, RINGING, STAGES
 LOG_DEPARTURE = math.log(DEPARTURE)
 PACE = 1.0  # prior: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary
 NEGLIGIBLE = -28.0  # numerics: nats below the best at which a hypothesis is dropped
-SAME_STATE = 14  # numerics: hypotheses of one state that are kept apart, ...
-SAME_DEPARTED = 4  # numerics: ... and of one that is off the task
+SAME_STATE = 14  # numerics: most hypotheses of one state of the task
+SAME_DEPARTED = 4  # numerics: most hypotheses of one state off the task
 
 
 class Table(NamedTuple):
-    """Hypotheses (most,) and what each knows of the task's blocks and moves (most, num_quantities, 2)."""
+    """Hypotheses (most,) with their knowledge of the task's blocks and moves (most, num_quantities, 2)."""
 
     rows: np.ndarray
     known: np.ndarray
@@ -46,7 +46,7 @@ class Table(NamedTuple):
 class Chain(NamedTuple):
     """States of one round, then those off the task: kind, block (num_states,) and move (-1: none).
 
-    `signs` (num_moves,): which way a move goes where that is known, 0 elsewhere.
+    `signs` (num_moves,): direction in which a move raises its block where known, otherwise 0.
     """
 
     kinds: np.ndarray
@@ -67,7 +67,7 @@ def _settled(age):
 
 @compiled
 def _copy(into, i, other, j):
-    """Make hypothesis i of a table what j of another is."""
+    """Overwrite hypothesis i of a table by hypothesis j of another."""
     into.rows[i] = other.rows[j]
     for q in range(into.known.shape[1]):
         into.known[i, q, 0], into.known[i, q, 1] = other.known[j, q, 0], other.known[j, q, 1]
@@ -91,7 +91,7 @@ def _mix(one, other, a, b):
 
 @compiled
 def absorb(into, i, other, j):
-    """Merge hypothesis j of `other` into i of `into`, of the same state, by moments; the weights add."""
+    """Merge hypothesis j of `other` into i of `into`, of the same state, by moments; their weights add."""
     h, g = into.rows[i], other.rows[j]
     total = log_sum(h.weight, g.weight)
     a, b = math.exp(h.weight - total), math.exp(g.weight - total)
@@ -110,7 +110,7 @@ def absorb(into, i, other, j):
 
 @compiled
 def _enter(h, known, t, half, chain, before, after):
-    """Rewrite a hypothesis that leaves state `before` for `after`; whether its block rose the wrong way."""
+    """Move a hypothesis from state `before` to `after`; returns whether its block rose the wrong way."""
     kinds = chain.kinds
     h.state = after
     h.entered[0], h.entered[1] = t - half, half * half / 3
@@ -136,7 +136,7 @@ def _enter(h, known, t, half, chain, before, after):
 
 @compiled
 def _add(table, count, fresh, j):
-    """Append a hypothesis unless one of its state was entered at the same time, which then takes it up."""
+    """Append a hypothesis, or merge it into one of its state that was entered at the same time."""
     state, entered = fresh.rows[j].state, fresh.rows[j].entered[0]
     for i in range(count):
         if table.rows[i].state == state and abs(table.rows[i].entered[0] - entered) < 1e-9:
@@ -150,7 +150,7 @@ def _add(table, count, fresh, j):
 
 @compiled
 def _advance(table, count, fresh, t, dt, chain):
-    """Hypotheses that move on to the task's next state, and what stays of the others."""
+    """Let hypotheses move on to the task's next state, in part."""
     num_new, half, away = 0, dt / 2, -math.expm1(-dt / PACE)
     for i in range(count):
         state = table.rows[i].state
@@ -167,17 +167,10 @@ def _advance(table, count, fresh, t, dt, chain):
         h.ring[at, 0], h.ring[at, 1] = t - half, half * half / 3
         h.crossed += 1
         if _enter(h, fresh.known[num_new], t, half, chain, state, 1 if off else state + 1):
-            # another block, or another place: from here on off the task
+            # another block, or another place: a departure
             h.state, h.missed, h.left_at = chain.num_steps, state, t
         table.rows[i].weight += math.log1p(-away)
-        merged = False
-        for j in range(num_new):
-            if fresh.rows[j].state == h.state:
-                absorb(fresh, j, fresh, num_new)
-                merged = True
-                break
-        if not merged:
-            num_new += 1
+        num_new = _add(fresh, num_new, fresh, num_new)
     for j in range(num_new):
         count = _add(table, count, fresh, j)
     return count
@@ -185,7 +178,7 @@ def _advance(table, count, fresh, t, dt, chain):
 
 @compiled
 def _may_follow(chain, before, after):
-    """Whether a hand may go from one contact state to another: not on from one block to the next."""
+    """Whether one contact state may follow another: a hand changes blocks only through free motion."""
     kinds, blocks = chain.kinds, chain.blocks
     same = blocks[before] == blocks[after]
     if kinds[before] == kinds[after] and same:
@@ -195,12 +188,11 @@ def _may_follow(chain, before, after):
 
 @compiled
 def _depart(table, count, fresh, t, dt, chain):
-    """Hypotheses that leave the task, or what they do off it, for any other contact state."""
+    """Let hypotheses leave the task, or change state off the task, in part."""
     num_steps, num_states = chain.num_steps, chain.kinds.size
     log_away = math.log(-math.expm1(-dt / PACE))
     num_new = 0
     for target in range(num_steps, num_states):
-        found = -1
         for i in range(count):
             state = table.rows[i].state
             if not _may_follow(chain, state, target):
@@ -215,19 +207,13 @@ def _depart(table, count, fresh, t, dt, chain):
                 weight += LOG_DEPARTURE
             if weight < NEGLIGIBLE:
                 continue
-            at = num_new if found < 0 else num_new + 1
-            _copy(fresh, at, table, i)
-            h = fresh.rows[at]
+            _copy(fresh, num_new, table, i)
+            h = fresh.rows[num_new]
             h.weight = weight
-            _enter(h, fresh.known[at], t, dt / 2, chain, state, target)
+            _enter(h, fresh.known[num_new], t, dt / 2, chain, state, target)
             if state < num_steps:
                 h.missed, h.left_at = min(state + 1, num_steps - 1), t - dt / 2
-            if found < 0:
-                found = num_new
-            else:
-                absorb(fresh, found, fresh, at)
-        if found >= 0:
-            num_new += 1
+            num_new = _add(fresh, num_new, fresh, num_new)
     for j in range(num_new):
         count = _add(table, count, fresh, j)
     return count
@@ -235,7 +221,7 @@ def _depart(table, count, fresh, t, dt, chain):
 
 @compiled
 def _thin(table, count, state, most, t):
-    """Merge hypotheses of one state, those that differ least first, until `most` are left."""
+    """Merge the most similar hypotheses of one state until `most` are left."""
     rows = table.rows
     while True:
         members = 0
@@ -290,12 +276,12 @@ def _explained(h, known, x, chain, span, pads, gravity):
 @compiled
 def advance(rows, known, fresh_rows, fresh_known, count, reading, dt, since, share, states, signs, num_steps,
             num_blocks, num_rounds, ranges, compliances, gravity):  # fmt: skip
-    """Take one reading in; the number of hypotheses afterwards.
+    """Process one reading; returns the number of hypotheses afterwards.
 
-    `rows`, `known`: the table, and a few hypotheses more to work with; `dt` [s] since the reading before,
-    `since` [s] since departures were last allowed (0: not now), `share`: how much of an independent reading
-    it is; `states` (num_states, 3), ...: the chain; `compliances` (4,): the pads'. Log weights are normalised
-    to a maximum of 0. Plain arrays cost a call from Python a tenth of what named ones do.
+    `rows`, `known`: the table, and a few hypotheses as workspace; `dt` [s] since the previous reading,
+    `since` [s] since departures were last allowed (0: not now), `share`: weight of the reading as independent
+    evidence; `states` (num_states, 3), ...: the chain; `compliances` (4,): the pads'. Log weights are
+    normalised to a maximum of 0. Plain arrays make a call from Python ten times as fast as named tuples.
     """
     x, span = reading[0], ranges[0]
     table, fresh = Table(rows, known), Table(fresh_rows, fresh_known)
@@ -327,7 +313,7 @@ def advance(rows, known, fresh_rows, fresh_known, count, reading, dt, since, sha
 
 @compiled
 def _state_at(h, t, num_steps):
-    """State of the task at an earlier t; -1: off the task."""
+    """State of the task at an earlier time t; -1: off the task."""
     state = h.state
     if state >= num_steps:
         if h.left_at <= t:
@@ -342,11 +328,11 @@ def _state_at(h, t, num_steps):
 
 @compiled
 def summarise(rows, known, count, num_steps, num_blocks, before, now, smoothed, means):
-    """Indices of the heaviest hypothesis on the task and of that off it, -1 where there is none.
+    """Indices of the heaviest hypothesis on the task and off it, -1 if there is none.
 
-    Fills `now`, `smoothed` (num_steps + 1,): probability of each subtask, and last of none of them, at the
-    newest reading and at the time `before`; `means` (2 num_blocks + num_moves, 3): mean, variance
-    and probability that it is known of weights and widths, then rises.
+    Fills `now`, `smoothed` (num_steps + 1,): probability of each subtask, and last of a departure, at the
+    newest reading and at time `before`; `means` (2 num_blocks + num_moves, 3): mean, variance and probability
+    of being known of weights and widths, then of rises.
     """
     now[:], smoothed[:], means[:] = 0.0, 0.0, 0.0
     total = 0.0
@@ -386,9 +372,9 @@ def summarise(rows, known, count, num_steps, num_blocks, before, now, smoothed, 
 
 @compiled
 def boundary(rows, count, num_steps, number, before):
-    """Mean, variance of crossing `number` (from 0), the probability that it has come, and by `before`.
+    """Mean and variance of crossing `number` (from 0), and the probabilities of it, and of it by `before`.
 
-    Off the task nothing is a boundary of it: all of them given that the recording follows its task.
+    All given that the recording follows its task, as nothing off the task is a boundary of it.
     """
     total = come = early = mean = square = 0.0
     for i in range(count):

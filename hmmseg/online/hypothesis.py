@@ -1,19 +1,19 @@
-"""One hypothesis: what it holds, how well it explains a reading, and what a reading teaches it.
+"""One hypothesis: its state, the likelihood of a reading under it, and its update by a reading.
 
-A hypothesis is one history of contact states with what follows from it, each quantity in the form in which
-evidence adds up: means as (precision x mean, precision), squared scales as (weighted sum of squares, weight).
-A precision of 0 is a quantity of which nothing is known.
+A hypothesis is one history of contact states with its consequences, each quantity in additive form: means as
+(precision x mean, precision), squared scales as (weighted sum of squares, weight). A precision of 0 means
+that the quantity is unknown.
 
-The log-likelihoods are those of hmmseg.segmentation.emissions (tested against them), with what is not yet
-known integrated out: an unknown weight, width or level has a broad density over the range seen, and known
-ones add their variance. And a hand that is free, or carries, may halt: without what follows, a halt would
-pass for a rest on something, as that predicts positions so much better. What was just lifted moves, and what
-is held still bears what it bore a reading before: a block not weighed yet, held on its support, would pass
-for one carried at rest, whose weight is what the fingers happen to bear.
+The log-likelihoods are those of hmmseg.segmentation.emissions (tested against them), with unknowns integrated
+out: an unknown weight, width or level has a broad density over the range seen, and known ones add their
+variance. A hand that is free, or carries, may also halt: otherwise a halt would pass for a rest on something,
+which predicts positions much better. A block that was just lifted moves, and the load of a resting block is
+that of the reading before: otherwise a block not yet weighed, held on its support, would pass for one carried
+at rest, whose weight is the load on the fingers.
 
-Everything looks back only. A reading is the mean of the last WINDOW s, as recordings are read off line;
-the vertical acceleration is the slope of the velocity over the last SLOPE s, and a velocity that is not
-measured the difference to the row before.
+Everything is causal. A reading is the mean of the last WINDOW s, as off line; the vertical acceleration is
+the slope of the velocity over the last SLOPE s, and an unmeasured velocity is the difference to the previous
+row.
 """
 
 from __future__ import annotations
@@ -28,46 +28,46 @@ from hmmseg.levels import MOVED, TAIL
 from hmmseg.online.compiled import compiled
 from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, STRAY, TOUCHING, WINDOW
 
-NUM_RING = 8  # numerics: boundaries that are remembered, the last ones; a move has four
-# numerics: which scale of residuals is which, as the emissions off line name them
+NUM_RING = 8  # numerics: most recent boundaries remembered; a move has four
+# numerics: order of the residuals' scales, named as in hmmseg.segmentation.emissions
 SCALES = ("force", "carry", "net_x", "shear", "velocity", "level", "width")
 FORCE, CARRY, NET_X, SHEAR, VELOCITY, LEVEL, WIDTH = range(7)
 FREE_KIND, GROUND_KIND, SLIDING_KIND, ABOVE_KIND = range(4)  # of contact states
-# What a hypothesis knows of blocks is an array of its own, (num_quantities, 2): weight [N] and width [m] of
-# every block and of any other one, then the rise [m] of every move.
+# Evidence about blocks is a separate array (num_quantities, 2): weight [N] and width [m] of every block and
+# of an unnamed one, then the rise [m] of every move.
 HYPOTHESIS = np.dtype([
-    ("weight", "f8"),  # its logarithm
-    ("state", "i8"),  # 0 ... of the round's subtasks, then those off the task
-    ("round", "i8"), ("crossed", "i8"),  # boundaries crossed so far
-    ("missed", "i8"), ("left_at", "f8"),  # the subtask not reached any more (-1: none), since when [s]
-    ("entered", "f8", 2), ("origin", "f8", 2),  # mean and variance: when [s], level at the pickup [m]
-    ("ring", "f8", (NUM_RING, 2)),  # the same of the last boundaries [s]
-    ("bias", "f8", (4, 2)), ("scale", "f8", (7, 2)), ("level", "f8", 2),  # evidence; where the block rests
+    ("weight", "f8"),  # log weight
+    ("state", "i8"),  # subtasks of the round, then states off the task
+    ("round", "i8"), ("crossed", "i8"),  # number of boundaries crossed
+    ("missed", "i8"), ("left_at", "f8"),  # after a departure: missing subtask (-1: none), since when [s]
+    ("entered", "f8", 2), ("origin", "f8", 2),  # mean and variance: time of entry [s], level at pickup [m]
+    ("ring", "f8", (NUM_RING, 2)),  # mean and variance of the last boundaries [s]
+    ("bias", "f8", (4, 2)), ("scale", "f8", (7, 2)), ("level", "f8", 2),  # evidence; level: of the support
 ])  # fmt: skip
 READING = np.dtype([
     ("t", "f8"), ("force", "f8", 4), ("vx", "f8"), ("vy", "f8"), ("ay", "f8"), ("y", "f8"), ("d", "f8"),
     ("sd_y", "f8"), ("sd_d", "f8"), ("sd_vx", "f8"), ("sd_vy", "f8"),
-    ("last_y", "f8"), ("last_d", "f8"), ("last_fy", "f8"),  # of the reading, net fy 1 / MAX_RATE s before
-    ("sd_fx", "f8"), ("sd_fy", "f8"),  # what may be wrong with net forces (the tool on a wrist's sensor)
-    ("gripped", "f8"),  # 0: nothing is held, 2: something is, as more than forces tells; 1: none does
+    ("last_y", "f8"), ("last_d", "f8"), ("last_fy", "f8"),  # previous reading's; net fy 1 / MAX_RATE s before
+    ("sd_fx", "f8"), ("sd_fy", "f8"),  # error of net forces from the tool on a wrist's sensor
+    ("gripped", "f8"),  # known apart from forces: 0: nothing is held, 2: something is; 1: unknown
 ])  # fmt: skip
-# Ranges of what is free to be anywhere (see hmmseg.segmentation.emissions).
+# Ranges of unconstrained quantities (see hmmseg.segmentation.emissions).
 RANGES = np.dtype([(name, "f8") for name in ("vx", "vy", "y", "d", "force", "press")])
-# A row that is looked back at: reach of the joints' noise (x, y), forces, vx, vy, y and d, mean net fy.
+# A row kept for averages: reach of the joints' noise (x, y); forces, vx, vy, y and d; mean net fy.
 ROW = np.dtype([("t", "f8"), ("reach", "f8", 2), ("value", "f8", 8), ("fy", "f8")])
 
 SLOPE = 1.0 / MAX_RATE
-ROWS = 512  # numerics: rows looked back at, at most: 20 kHz over SLOPE
+ROWS = 512  # numerics: most rows kept: 20 kHz over SLOPE
 
 
 @compiled
 def read(rows, head, filled, t, dt, channels, jointed, geometry, measured, before, noise, out):
-    """Take a row into the ring and fill `out` with the reading at `t` [s].
+    """Add a row to the ring and fill `out` with the reading at `t` [s].
 
-    `rows` (ROWS,) is a ring whose newest row goes to `head`, `filled` of them are there; `dt` [s] since the
-    row before, whose channels are `before` (12,). `channels` (12,): q11, q12, dq11, dq12, fx1, fy1, q21, ...,
-    or x1, y1, vx1, vy1, ...; `geometry` (8,): bases and links of both fingers; `measured`: whether velocities
-    are; `noise` (2,): squared noise of one position and of one velocity [rad or m, and per s].
+    `rows` (ROWS,): ring whose newest row goes to `head`, with `filled` rows; `dt` [s] since the previous row,
+    whose channels are `before` (12,). `channels` (12,): q11, q12, dq11, dq12, fx1, fy1, q21, ..., or x1, y1,
+    vx1, vy1, ...; `geometry` (8,): bases and links of both fingers; `measured`: whether velocities are;
+    `noise` (2,): squared noise of one position and of one velocity [rad or m, and per s].
     """
     here, x = rows[head], out[0]
     x.last_y, x.last_d = x.y, x.d
@@ -122,7 +122,8 @@ def read(rows, head, filled, t, dt, channels, jointed, geometry, measured, befor
     spread = num * sum_tt - sum_t * sum_t
     x.ay = (num * sum_tv - sum_t * sum_v) / spread if num > 1 and spread > 0.0 else math.nan
     x.t = t
-    # One finger's noise is `reach` times the joints'; y and velocities are means of both, d the difference.
+    # A fingertip's noise is `reach` times the joints'; y and velocities are means over both fingers, d the
+    # difference.
     share = 1.0 / (2 * number)
     x.sd_y = math.sqrt(noise[0] * here.reach[1] * share)
     x.sd_d = 2 * math.sqrt(noise[0] * here.reach[0] * share)
@@ -133,7 +134,7 @@ def read(rows, head, filled, t, dt, channels, jointed, geometry, measured, befor
 
 @compiled
 def _mean(rows, head, number, k):
-    """Mean of a value over the last rows, NaN where it is in none of them."""
+    """Mean of a value over the last rows, NaN if missing in all of them."""
     total, num = 0.0, 0
     for back in range(number):
         value = rows[(head - back) % ROWS].value[k]
@@ -145,7 +146,7 @@ def _mean(rows, head, number, k):
 
 @compiled
 def widen(extremes, ranges, least, x):
-    """Ranges that the emissions take as possible, so far and not below `least` (4,)."""
+    """Extend the ranges of the emissions by a reading; they stay above `least` (4,)."""
     span, x = ranges[0], x[0]
     for k, value in enumerate((x.vx, x.vy, x.y, x.d)):
         if not math.isnan(value):
@@ -161,14 +162,14 @@ def widen(extremes, ranges, least, x):
         span.press = max(span.press, 1.5 * abs(x.force[1] + x.force[3]))
 
 
-STILL = 0.2  # prior: share of samples at which a hand that may move stands still,
+STILL = 0.2  # prior: share of samples at which a moving hand stands still
 CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
-JUST_LIFTED = 0.05  # prior: ... times this while a lift begins: slow, but a motion
-ALIKE = 0.5  # prior: probability that a block not met yet is like one that was
+JUST_LIFTED = 0.05  # prior: factor of STILL while a lift begins: slow, but a motion
+ALIKE = 0.5  # prior: probability that a new block resembles an earlier one
 _LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
 _LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
-_ROOT2 = math.sqrt(2.0)  # numerics: worked out once
+_ROOT2 = math.sqrt(2.0)  # numerics: computed once
 
 
 @compiled
@@ -180,7 +181,7 @@ def log_sum(a, b):
 
 @compiled
 def _log_rising(value, scale, span):
-    """Log density of value = w + noise (sd `scale`), w of a density that rises from 0 to `span`.
+    """Log density of value = w + noise (sd `scale`), with w of a density that rises from 0 to `span`.
 
     The integral of 2 w / span^2 times the normal density over w > 0 is
     2 (v Phi(v / s) + s phi(v / s)) / span^2.
@@ -193,7 +194,7 @@ def _log_rising(value, scale, span):
 
 @compiled
 def _log_broad(value, span):
-    """Log density of a value that may be anywhere in `span`; 0 where missing."""
+    """Log density of a value uniform over `span`; 0 where missing."""
     return 0.0 if math.isnan(value) else -math.log(span)
 
 
@@ -211,27 +212,27 @@ def _square(h, which):
 
 @compiled
 def _carry(h, x):
-    """Variance of the net vertical force of what is carried [N^2]."""
+    """Variance of the net vertical force of a carried block [N^2]."""
     return _square(h, CARRY) + x.sd_fy * x.sd_fy
 
 
 @compiled
 def _held_width(h, x, pads):
-    """Width of what is held [m], as if rigid where a force is missing."""
+    """Width of the held block [m], with rigid pads where a force is missing."""
     width = block_width(x.d, _force(h, x, 0), _force(h, x, 2), pads)
     return x.d if math.isnan(width) else width
 
 
 @compiled
 def _held_height(h, x, pads):
-    """Height of what is held [m], as if rigid where a force is missing."""
+    """Height of the held block [m], with rigid pads where a force is missing."""
     height = block_y(x.y, _force(h, x, 1), _force(h, x, 3), pads)
     return x.y if math.isnan(height) else height
 
 
 @compiled
 def _ungripped(h, x, span):
-    """Log density of the forces without a grip: silent, or one finger's alone."""
+    """Log density of the forces without a grip: silent, or from one finger only."""
     silent1 = silent2 = touch1 = touch2 = 0.0
     noise = _square(h, FORCE)
     scale = math.sqrt(noise)
@@ -252,10 +253,10 @@ def _ungripped(h, x, span):
 
 @compiled
 def _log_known(value, factor, known, q, others, variance, share, span, rising):
-    """Log density of value = factor x quantity `q`, of which `known` is the evidence; broad where unknown.
+    """Log density of value = factor x quantity `q` given the evidence `known`; broad if unknown.
 
-    It may be like that of `others` further blocks. `rising`: what is unknown has a density that rises from 0,
-    as a block of no weight is none.
+    An unknown quantity may resemble that of the `others`. `rising`: its density rises from 0, as a block has
+    weight.
     """
     if math.isnan(value):
         return 0.0
@@ -280,7 +281,7 @@ def _log_known(value, factor, known, q, others, variance, share, span, rising):
 
 @compiled
 def _halting(h, x, span):
-    """Log density of the velocities and the height of a hand that halts, over that of one that moves."""
+    """Log density ratio of the velocities and height of a hand that halts to one that moves."""
     out, moving = 0.0, _square(h, VELOCITY)
     if not math.isnan(x.vx):
         out += log_student(x.vx, math.sqrt(x.sd_vx**2 + moving)) + math.log(span.vx)
@@ -307,7 +308,7 @@ def free(h, x, span):
 
 @compiled
 def held(h, known, block, num_blocks, x, span, pads):
-    """Log-likelihood of what a reading of any grip of this block shows."""
+    """Log-likelihood of the features of a reading common to all grips of this block."""
     fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
     out = log_between((fx1 - fx2) / 2, 0.0, span.force, math.sqrt(_square(h, FORCE)))
     if x.gripped == 0.0:
@@ -321,7 +322,7 @@ def held(h, known, block, num_blocks, x, span, pads):
 
 @compiled
 def lifted(h, known, block, num_blocks, x, span, gravity, settled):
-    """Log-likelihood of what a reading shows besides of a block above the ground.
+    """Log-likelihood of the remaining features, of a block above the ground.
 
     `settled`: probability that it has been there for a while, and may halt.
     """
@@ -335,7 +336,7 @@ def lifted(h, known, block, num_blocks, x, span, gravity, settled):
 
 @compiled
 def supported(h, known, kind, block, x, span, pads, levels):
-    """Log-likelihood of what a reading shows besides of a block on its support.
+    """Log-likelihood of the remaining features, of a block on its support.
 
     `levels`: whether the height at which the block rests counts.
     """
@@ -347,7 +348,7 @@ def supported(h, known, kind, block, x, span, pads, levels):
     moving = _square(h, VELOCITY)
     upward, broad = log_student(x.vy, math.sqrt(x.sd_vy**2 + moving)), _log_broad(x.vy, span.vy)
     resting, change = force + upward, x.force[1] + x.force[3] - x.last_fy
-    if not weighed and not math.isnan(change):  # what stands bears what it bore
+    if not weighed and not math.isnan(change):  # the load of a resting block is steady
         same = log_student(change, 2 * math.sqrt(_square(h, FORCE)))
         same += log_student(x.vy, math.sqrt(x.sd_vy**2 + CREEP**2))
         resting = log_sum(_LOG_MOVING + resting, _LOG_STILL + same)
@@ -368,14 +369,14 @@ def supported(h, known, kind, block, x, span, pads, levels):
 
 
 MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
-MOST_SCALE = 200.0  # chosen: and a scale
-LEAST = 1e-12  # numerics: N^2, m^2; least squared scales are those of hmmseg.segmentation.fit:
-FLOOR = 0.09  # chosen: ... 0.3 of a sample's own noise
+MOST_SCALE = 200.0  # chosen: readings that a scale remembers
+LEAST = 1e-12  # numerics: N^2, m^2; least squared scale
+FLOOR = 0.09  # chosen: least squared scale over a sample's variance: 0.3^2, as in hmmseg.segmentation.fit
 
 
 @compiled
 def _learn_mean(evidence, value, variance, share, most):
-    """Robust conjugate update of a mean by a value of this variance, worth `share` of a reading."""
+    """Robust conjugate update of a mean by a value of this variance, with weight `share`."""
     if math.isnan(value):
         return
     robust = 1.0
@@ -393,7 +394,7 @@ def _learn_mean(evidence, value, variance, share, most):
 
 @compiled
 def _learn_scale(evidence, residual, share, least):
-    """Robust update of a squared scale, which stays above `least`."""
+    """Robust update of a squared scale, bounded below by `least`."""
     if math.isnan(residual):
         return
     square = residual * residual
@@ -409,7 +410,7 @@ def _learn_scale(evidence, residual, share, least):
 
 @compiled
 def learn(h, known, kind, block, x, pads, gravity, share, levels):
-    """Update a hypothesis by a reading taken in its state; `share`: of an independent reading."""
+    """Update a hypothesis by a reading taken in its state, with weight `share`."""
     noise = _square(h, FORCE)
     if kind == FREE_KIND:
         for c in range(4):
@@ -420,15 +421,15 @@ def learn(h, known, kind, block, x, pads, gravity, share, levels):
     fy1, fy2 = _force(h, x, 1), _force(h, x, 3)
     _learn_scale(h.scale[NET_X], _force(h, x, 0) + _force(h, x, 2), share, noise)
     _learn_scale(h.scale[SHEAR], (fy1 - fy2) / 2, share, noise)
-    weight, width, found = known[2 * block], known[2 * block + 1], _held_width(h, x, pads)
+    weight, width, measured = known[2 * block], known[2 * block + 1], _held_width(h, x, pads)
     if width[1] > 0.0:
-        _learn_scale(h.scale[WIDTH], found - width[0] / width[1], share, FLOOR * x.sd_d**2)
-    _learn_mean(width, found, x.sd_d * x.sd_d + _square(h, WIDTH), share, math.inf)
+        _learn_scale(h.scale[WIDTH], measured - width[0] / width[1], share, FLOOR * x.sd_d**2)
+    _learn_mean(width, measured, x.sd_d * x.sd_d + _square(h, WIDTH), share, math.inf)
     if kind == ABOVE_KIND:
         factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
         if weight[1] > 0.0:
             _learn_scale(h.scale[CARRY], fy1 + fy2 - factor * weight[0] / weight[1], share, noise)
-        if factor > 0.1:  # in free fall a force says nothing of the weight
+        if factor > 0.1:  # in free fall forces do not show the weight
             _learn_mean(weight, (fy1 + fy2) / factor, _carry(h, x) / (factor * factor), share, math.inf)
         return
     _learn_scale(h.scale[VELOCITY], x.vy, share, FLOOR * x.sd_vy**2)

@@ -1,4 +1,4 @@
-"""`Watcher`: rows of a recording as they come, in whatever order and at whatever pace."""
+"""`Watcher`: follows a recording row by row as it arrives, in any order and at any pace."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.roll import level_row
+from hmmseg.hand.signals import level_row
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import ROLL
@@ -19,9 +19,9 @@ from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
 from hmmseg.online.wrist import Wrist, checked
 
-LAG = 1.0  # chosen: s, unless another is wanted: contacts ring for a fifth of that
-SNAPSHOTS = 10  # numerics: points over the lag to which a late row returns
-USUAL = 0.02  # numerics: how fast the usual interval follows
+LAG = 1.0  # chosen: s; default lag: contacts ring for a fifth of that
+SNAPSHOTS = 10  # numerics: points per lag to which a late row can return
+USUAL = 0.02  # numerics: update rate of the usual interval
 ODD = {
     "repeated": "repeated: the row at {t:.9g} s came before, and counts once",
     "contradictory": "contradictory: another row at {t:.9g} s came before; the first one counts",
@@ -31,7 +31,7 @@ ODD = {
 
 
 class Watcher:
-    """Follows one performance of a task of blocks, row by row.
+    """Follows one performance of a block task, row by row.
 
         watcher = Watcher("task.toml", "rig.toml")
         for t, channels in rows:                # channels: in the order of watcher.channels, or a dict
@@ -39,9 +39,9 @@ class Watcher:
             print(answer.subtask.name, answer.probabilities, answer.fits)
         final = watcher.finish()
 
-    `lag` [s]: how long a boundary is waited for before it is settled. Time and memory a row do not grow.
-    A late row is put in its place as long as that is within the lag; `counts` says how many rows were late,
-    repeated, or followed a gap. A gripper with a sensor in its wrist is followed a smoothing window late,
+    `lag` [s]: delay after which a boundary is settled. Time and memory per row are bounded. A late row is
+    inserted in its place if it is within the lag; `counts` tells how many rows were late, repeated, or
+    followed a gap. A gripper with a sensor in its wrist is followed with the delay of a smoothing window,
     from its first grip on (`hmmseg.online.wrist`). InputError for a plain ordered task.
     """
 
@@ -59,15 +59,15 @@ class Watcher:
         if self._wrist is not None:
             self.channels, self.optional = self._wrist.names, ()
         self.counts: Counter[str] = Counter()
-        self._mark: Any = None  # where the last grip of a wrist's gripper began
-        self._snapshots: deque[tuple[float, Any]] = deque()
-        self._roll = 0.0  # of the hand, as last recorded [rad]
+        self._mark: Any = None  # snapshot of the start of a wrist gripper's last grip
+        self._snapshots: deque[tuple[float, Any]] = deque(maxlen=SNAPSHOTS + 1)
+        self._roll = 0.0  # last recorded roll of the hand [rad]
         self._every = max(float(lag), 0.1) / SNAPSHOTS
         self._usual = 1.0 / hand.rate if hand.rate else math.nan
 
     @property
     def forces(self) -> tuple[float, float]:
-        """Grip and net vertical force of the newest row that was read [N], NaN before the first."""
+        """Grip and net vertical force of the newest row [N], NaN before the first."""
         rows = self.filter.rows
         if not rows:
             return math.nan, math.nan
@@ -76,11 +76,11 @@ class Watcher:
 
     @property
     def lag(self) -> float:
-        """How long a boundary is waited for [s]."""
+        """Delay after which a boundary is settled [s]."""
         return self.filter.lag
 
     def update(self, t: float, channels: Sequence[float] | Mapping[str, float] | np.ndarray) -> Answer:
-        """Take one row.
+        """Process one row.
 
         Args:
             t: its time [s].
@@ -88,16 +88,16 @@ class Watcher:
                 missing. Velocities of a Cartesian hand that are always missing are derived from positions.
 
         Returns:
-            What is known at the newest row; `note` says what was irregular about this one.
+            The answer at the newest row; its `note` describes an irregularity of this row.
 
         Raises:
             ValueError: for another number of channels, or a time that is not finite.
-            InputError: for an orientation that cannot be, or lifts that pull up.
+            InputError: for an impossible orientation, or lifts that pull up.
         """
         if isinstance(channels, Mapping):
             channels = [channels.get(name, math.nan) for name in self.channels]
         row = np.array(channels, dtype=np.float64)
-        rolls = ROLL in self.channels  # which stands last, and may be left out
+        rolls = ROLL in self.channels  # the last channel, may be left out
         if rolls and row.shape == (len(self.channels),):
             row = self._level(row)
         if row.shape != (len(self.channels) - rolls,):
@@ -106,55 +106,55 @@ class Watcher:
         if not math.isfinite(t):
             raise ValueError(f"t: {t}, expected a time in s")
         self.counts["rows"] += 1
-        f = self.filter
-        note = self._followed(t, row) if self._wrist is None else self._felt(self._wrist, t, row)
-        answer = f.answer()
+        note = self._take(t, row) if self._wrist is None else self._take_wrist(self._wrist, t, row)
+        answer = self.filter.answer()
         answer.note = note
         return answer
 
     def _level(self, row: np.ndarray) -> np.ndarray:
-        """The row as a level hand's; while its roll is missing it is taken to be the last one."""
+        """The row as a level hand's; a missing roll is taken to be the last one."""
         if not math.isnan(row[-1]):
             self._roll = float(row[-1])
         return level_row(row[:-1], self._roll) if self._roll else row[:-1]
 
-    def _followed(self, t: float, row: np.ndarray) -> str | None:
-        """Take a row, in its place; what was irregular about it."""
-        f, note = self.filter, None
-        rows = f.rows
-        if rows and t <= rows[-1][0]:
-            note = self._out_of_order(t, row)
-        else:
-            if rows:
-                note = self._gap(t - rows[-1][0])
-            if not self._snapshots or t >= self._snapshots[-1][0] + self._every:
-                self._snapshots.append((rows[-1][0] if rows else -math.inf, f.snapshot()))
-                while len(self._snapshots) > SNAPSHOTS + 1:
-                    self._snapshots.popleft()
-            f.take(t, row)
+    def _take(self, t: float, row: np.ndarray) -> str | None:
+        """Process a row; returns its irregularity."""
+        rows = self.filter.rows
+        newest = rows[-1][0] if rows else -math.inf
+        if t <= newest:
+            return self._out_of_order(t, row)
+        note = self._gap(t - newest) if rows else None
+        if not self._snapshots or t >= self._snapshots[-1][0] + self._every:
+            self._snapshots.append((newest, self.filter.snapshot()))
+        self.filter.take(t, row)
         return note
 
-    def _felt(self, wrist: Wrist, t: float, row: np.ndarray) -> str | None:
-        """Take a row of a wrist's sensor; what was irregular about it."""
+    def _take_wrist(self, wrist: Wrist, t: float, row: np.ndarray) -> str | None:
+        """Process a row of a wrist's sensor; returns its irregularity."""
         checked(self.filter.rig, t, row)
         newest = wrist.newest
-        stray = wrist.place(t, row)
-        if stray is None:
+        irregular = wrist.place(t, row)
+        if irregular is None:
             note = None if math.isnan(newest) else self._gap(t - newest)
         else:
-            self.counts[stray] += 1
-            note = ODD[stray].format(t=t, behind=newest - t, lag=wrist.delay)
-        self._take_felt(wrist, wrist.ready())
+            note = self._odd(irregular, t, newest - t, wrist.delay)
+        self._forward(wrist, wrist.ready())
         self.filter.idle(t)
         return note
 
-    def _take_felt(self, wrist: Wrist, rows: list[tuple[float, np.ndarray]]) -> None:
+    def _odd(self, kind: str, t: float, behind: float, lag: float) -> str:
+        """Count an irregular row and describe it."""
+        self.counts[kind] += 1
+        return ODD[kind].format(t=t, behind=behind, lag=lag)
+
+    def _forward(self, wrist: Wrist, rows: list[tuple[float, np.ndarray]]) -> None:
+        """Pass rows of the wrist's virtual fingers, with what it knows of them, on to the filter."""
         f = self.filter
         if wrist.tool is None:
             return
-        if f.force_noise is None:  # each finger has half of the sensor's, and their sum all of it
+        if f.force_noise is None:  # so that the sum of both fingers has the sensor's noise
             f.force_noise = wrist.tool.noise / math.sqrt(2)
-            f.together = max(f.together, wrist.delay)  # what is smoothed errs alike for as long as the window
+            f.together = max(f.together, wrist.delay)  # smoothing correlates errors over its window
         f.touches, f.properties.touch_sd = wrist.touches, wrist.touch_sd
         f.properties.force_sd = wrist.force_sd
         if wrist.back and self._mark is not None:
@@ -166,6 +166,7 @@ class Watcher:
             f.take(t, row)
 
     def _gap(self, dt: float) -> str | None:
+        """Update the usual interval by `dt` [s]; returns a note if that is a gap."""
         usual, self._usual = self._usual, dt if math.isnan(self._usual) else self._usual
         self._usual += USUAL * (min(dt, GAP * self._usual) - self._usual)
         if not dt > GAP * usual:
@@ -174,30 +175,26 @@ class Watcher:
         return f"gap: {dt:.3g} s since the row before"
 
     def _out_of_order(self, t: float, row: np.ndarray) -> str:
+        """Process a row that is not the newest; returns its irregularity."""
         f = self.filter
         newest = f.rows[-1][0]
         same = next((old for at, old in reversed(f.rows) if at == t), None)
         if same is not None:
-            if np.array_equal(same, row, equal_nan=True):
-                self.counts["repeated"] += 1
-                return ODD["repeated"].format(t=t)
-            self.counts["contradictory"] += 1
-            return ODD["contradictory"].format(t=t)
+            kind = "repeated" if np.array_equal(same, row, equal_nan=True) else "contradictory"
+            return self._odd(kind, t, newest - t, self.lag)
         while len(self._snapshots) > 1 and self._snapshots[-1][0] >= t:
             self._snapshots.pop()
         if self._snapshots[0][0] >= t:
-            self.counts["too late"] += 1
-            return ODD["too late"].format(behind=newest - t, lag=self.lag)
-        self.counts["late"] += 1
+            return self._odd("too late", t, newest - t, self.lag)
         taken = f.restore(self._snapshots[-1][1])
         for at, each in sorted([*taken, (t, row)], key=lambda pair: pair[0]):
             f.take(at, each)
-        return ODD["late"].format(behind=newest - t)
+        return self._odd("late", t, newest - t, self.lag)
 
     def finish(self) -> Answer:
-        """The last answer: every boundary that has come is settled, whatever its age."""
+        """The final answer, with all boundaries settled whatever their age."""
         if self._wrist is not None:
-            self._take_felt(self._wrist, self._wrist.ready(final=True))
+            self._forward(self._wrist, self._wrist.ready(final=True))
         return self.filter.finish()
 
     @property

@@ -1,10 +1,9 @@
-"""Rows of a gripper with a sensor in its wrist as the two fingers that a filter follows.
+"""Rows of a gripper with a sensor in its wrist, converted to the two fingers that a filter follows.
 
-As `hmmseg.hand.wrist`, from the rows so far. What the tool itself puts on the sensor is found from
-the free motion before the first grip, so nothing can be said before that (all of it is the task's first
-subtask anyhow), and anew at every further one. Motion is smoothed over a window, so rows come out a window
-late; while the gripper closes or lets go, until it is known when it touched: a touch shows only once the
-gripper stands.
+Causal version of `hmmseg.hand.wrist`. The tool's own load on the sensor is identified from the free motion
+before the first grip, so there is no output before that (all of it is the task's first subtask anyhow), and
+again at every further grip. Motion is smoothed over a window, so rows come out a window late; while the
+gripper closes or lets go, they wait until the touch is known, which shows only once the gripper stands.
 """
 
 from __future__ import annotations
@@ -25,39 +24,39 @@ from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
 from hmmseg.robust import bridged, white_sd
 
 WHERE = "stream"
-BATCH = 0.02  # numerics: s that are turned into fingers together
+BATCH = 0.02  # numerics: s of rows converted at once
 BACKLOG = 10.0  # numerics: s before the first grip that are kept for the filter
-APART = 8  # numerics: samples of free motion in a window from which the tool is found
-KEPT = 30.0  # chosen: s of rows from which the tool is found, and in which a grip may turn out to be none
-AROUND = 4  # numerics: windows kept before what is smoothed: it is then as in the whole recording
+APART = 8  # numerics: samples of free motion per window that identify the tool
+KEPT = 30.0  # chosen: s of rows that identify the tool, and within which a grip may be refuted
+AROUND = 4  # numerics: windows kept before the rows that are smoothed, for the same result as off line
 TOUCHES = 8  # numerics: touches kept: a boundary looks back over fewer
 
 
 class Wrist:
-    """Takes rows of `rig.gripper.channels` at times in s; gives rows of a Cartesian hand.
+    """Takes rows of `rig.gripper.channels` at times in s and returns rows of a Cartesian hand.
 
-    A row that comes out has 16 numbers: the Cartesian channels, how uncertain a change of force is in time
-    [s], by how much the tool's own share may be wrong, across and up [N], and 0 where nothing is held, 2
-    where something is, 1 close to a touch. `touch_sd` [m], `touches` [s, s]: as in `Trial`.
+    A returned row has 16 numbers: the Cartesian channels, the timing uncertainty of a change of force [s],
+    the error of the tool's own load, across and up [N], and 0 where nothing is held, 2 where something is, 1
+    close to a touch. `touch_sd` [m], `touches` [s, s]: as in `Trial`.
     """
 
     def __init__(self, rig: Rig) -> None:
         self.rig, self.gripper, self.names = rig, rig.wrist, rig.wrist.channels
-        self._rows: list[tuple[float, tuple[float, ...]]] = []  # the last ones, in order of time
-        self._out = -math.inf  # up to where rows have come out
+        self._rows: list[tuple[float, tuple[float, ...]]] = []  # the most recent, in order of time
+        self._out = -math.inf  # time of the last row returned [s]
         self._opening = Opening(rig.fingertip.normal_stiffness)
-        self._newest = dict.fromkeys(self.names, math.nan)  # of each channel
+        self._newest = dict.fromkeys(self.names, math.nan)  # last value of each channel
         self._window: float | None = None
-        self._fitted = 0  # grips before which the tool was found
+        self._fitted = 0  # number of grips when the tool was last identified
         self.tool: Tool | None = None
         self.touches: list[tuple[float, float]] = []
-        self.mark: float | None = None  # start of a new grip, which has not come out yet [s]
-        self.back = False  # the last grip was none: what has come out since it began comes again
-        self.force_sd = 0.0  # by how much a drift that free motion did not show may be wrong in a grip [N]
+        self.mark: float | None = None  # start of a new grip that has not been returned yet [s]
+        self.back = False  # the last grip was refuted: rows since its start are returned again
+        self.force_sd = 0.0  # error in a grip from a drift that free motion did not show [N]
 
     @property
     def touch_sd(self) -> float:
-        """How well the openings at which pads touched are known [m]."""
+        """Uncertainty of the openings at which pads touch [m]."""
         sds = [each.grip.width_sd for each in self._opening.grips]
         return float(np.sqrt(np.mean(np.square(sds)))) if sds else 0.0
 
@@ -68,11 +67,11 @@ class Wrist:
 
     @property
     def delay(self) -> float:
-        """How much later than rows come in they come out [s], while the gripper stands or is open."""
+        """Delay of returned rows [s] while the gripper stands or is open."""
         return self._window or WINDOW
 
     def place(self, t: float, row: np.ndarray) -> str | None:
-        """Put a row in its place; what is irregular about that, in a word."""
+        """Insert a row in its place; returns its irregularity, in a word."""
         if self._rows and t <= self._rows[-1][0]:
             same = next((old for at, old in reversed(self._rows) if at == t), None)
             if same is not None:
@@ -90,7 +89,7 @@ class Wrist:
         return None
 
     def ready(self, final: bool = False) -> list[tuple[float, np.ndarray]]:
-        """Rows that are ready now, each once; with `final` all that are left."""
+        """Rows that are ready now, each once; with `final` all remaining ones."""
         if not self._rows:
             return []
         newest, opening = self.newest, self._opening
@@ -102,8 +101,8 @@ class Wrist:
         until = newest if final else min(newest - (self._window or 0.0), opening.known)
         if not final and until < self._out + BATCH and self._fitted == opening.number:
             return []
-        self._return()
-        out = self._turned(until)
+        self._rewind()
+        out = self._converted(until)
         self._out = max(self._out, until)
         return out
 
@@ -111,8 +110,8 @@ class Wrist:
         """Rows from t [s] on."""
         return self._rows[bisect_left(self._rows, t, key=lambda each: each[0]) :]
 
-    def _return(self) -> None:
-        """Go back to where a grip began that was none."""
+    def _rewind(self) -> None:
+        """Go back to the start of a refuted grip."""
         refused, self._opening.refused = self._opening.refused, None
         if refused is None or not self._rows or refused.start <= self._rows[0][0]:
             return
@@ -138,7 +137,7 @@ class Wrist:
         return np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
 
     def _find_tool(self, until: float) -> None:
-        """Find the tool from free motion up to a time [s]; it stays as it was where there is none."""
+        """Identify the tool from free motion up to a time [s]; unchanged if there is none."""
         trial = self._trial(-math.inf)
         if not _has_values(trial):
             return
@@ -152,7 +151,7 @@ class Wrist:
             since = float(motion.t.mean()) if motion.t.size else 0.0
             self.tool = tool_of(WHERE, self.rig, motion, since, between=self._fitted > 1)
 
-    def _turned(self, until: float) -> list[tuple[float, np.ndarray]]:
+    def _converted(self, until: float) -> list[tuple[float, np.ndarray]]:
         """Rows up to `until` as those of two fingers."""
         held = self._opening.held
         if self.tool is None or self._fitted != self._opening.number:
@@ -174,8 +173,8 @@ class Wrist:
                 near[max(start - 1, 0) : stop + 1] = 1.0
         for each in grips:
             near[each.start + 1 : each.stop - 1] = 2.0
-        found = as_fingers(trial, self.rig, pose, tool, self._opened(trial), force.copy(), grips,
-                           grip_force_of(trial.channels, self.gripper))  # fmt: skip
+        fingers = as_fingers(trial, self.rig, pose, tool, self._opened(trial), force.copy(), grips,
+                             grip_force_of(trial.channels, self.gripper))  # fmt: skip
         held = self._opening.held
         if held is not None and held.start <= until and not held.judged:
             start, stop = np.searchsorted(trial.t, [held.start, until]).tolist()
@@ -187,13 +186,11 @@ class Wrist:
                 self._opening.refuse()
         if self._opening.held is not None:
             self.force_sd = max(self.force_sd, tool.drift_sd * abs(until - tool.since))
-        self.touches += [touch for touch in found.touches if self._out < touch[0] <= until]
+        self.touches += [touch for touch in fingers.touches if self._out < touch[0] <= until]
         del self.touches[:-TOUCHES]
-        assert found.timing is not None and found.inertia is not None
-        table = np.stack(
-            [*(found.channels[name] for name in CARTESIAN_CHANNELS), found.timing, *found.inertia.T, near],
-            axis=1,
-        )
+        assert fingers.timing is not None and fingers.inertia is not None
+        channels = [fingers.channels[name] for name in CARTESIAN_CHANNELS]
+        table = np.stack([*channels, fingers.timing, *fingers.inertia.T, near], axis=1)
         table[np.isnan(np.stack(list(trial.channels.values()))).all(axis=0)] = np.nan
         chosen = np.flatnonzero((trial.t > self._out) & (trial.t <= until))
         return [(float(trial.t[i]), table[i]) for i in chosen]
@@ -205,7 +202,7 @@ def _has_values(trial: Trial) -> bool:
 
 
 def checked(rig: Rig, t: float, row: np.ndarray) -> None:
-    """InputError for a row's orientation that cannot be, which a stream tells by its time."""
+    """Raise InputError for an impossible orientation, naming the time of the row."""
     gripper = rig.gripper
     if gripper is None or gripper.quaternion is None:
         return
@@ -216,17 +213,17 @@ def checked(rig: Rig, t: float, row: np.ndarray) -> None:
         raise InputError(where, f"a quaternion of norm {norm:.3g}", "a norm of 1 (x, y, z, w)")
 
 
-STAND = 0.1  # chosen: s of next to no motion: the gripper stands
-PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as a boundary is waited for
+STAND = 0.1  # chosen: s of almost no motion after which the gripper stands
+PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as the default lag
 NOISE = 200  # numerics: samples that determine the opening's noise
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
 
 
 @dataclass
 class Held:
-    """One grip: from `start` to `stop` [s], inf while it lasts; `grip` as off line.
+    """One grip, from `start` to `stop` [s], inf while it lasts; `grip` as off line.
 
-    `judged`: whether it is known that the hand bears something.
+    `judged`: whether the hand is known to bear a load.
     """
 
     start: float
@@ -236,10 +233,10 @@ class Held:
 
 
 class Opening(Closings):
-    """Follows an opening, sample by sample, between pads of a stiffness [N/m].
+    """Follows an opening sample by sample, between pads of a stiffness [N/m].
 
-    `grips`: those of the last KEPT s. `known` [s]: up to when it is known what is held. `number`: grips so
-    far. `refused`: the last one, where it was none.
+    `grips`: those of the last KEPT s. `known` [s]: time up to which it is known what is held. `number`: of
+    grips so far. `refused`: the last grip, if it was refuted.
     """
 
     def __init__(self, stiffness: float) -> None:
@@ -247,25 +244,25 @@ class Opening(Closings):
         self.stiffness, self.number, self.known = stiffness, 0, -math.inf
         self.grips: list[Held] = []
         self.refused: Held | None = None
-        self._way: deque[tuple[float, float, float]] = deque()  # since it was widest
+        self._way: deque[tuple[float, float, float]] = deque()  # samples since it was widest
         self._low, self._high = math.inf, -math.inf
         self._noise, self._recent = 0.0, []
         self._fastest, self._wide = 0.0, math.nan
 
     @property
     def held(self) -> Held | None:
-        """The grip that lasts."""
+        """The current grip."""
         return self.grips[-1] if self.grips and self.grips[-1].stop == math.inf else None
 
     def free(self, t: np.ndarray, opening: np.ndarray) -> np.ndarray:
-        """Which samples are surely of free motion: outside of every grip, more open than halfway."""
+        """Samples that surely are free motion: outside every grip, more open than halfway."""
         free = t <= self.known
         for held in self.grips:
             free &= (t < held.start) | ((t >= held.stop) & (opening >= (held.grip.held + self._high) / 2))
         return free
 
     def follow(self, t: float, opening: float, pressing: float = math.nan) -> None:
-        """The next sample; `pressing` [N]: what each pad presses with, where it is known."""
+        """Process a sample; `pressing` [N]: force of each pad, where known."""
         if len(self._recent) < NOISE:
             self._recent.append(opening)
             if len(self._recent) % (NOISE // 10) == 0:
@@ -287,7 +284,7 @@ class Opening(Closings):
             self.known = t
 
     def _close(self, t: float, opening: float) -> None:
-        """Samples wait until it stands."""
+        """While closing, samples wait until the gripper stands."""
         self.known = max(self.known, t - PATIENCE)
         then = next((each for each in reversed(self._way) if t - each[0] >= STAND - 1e-9), None)
         if then is None:
@@ -307,8 +304,8 @@ class Opening(Closings):
         self.number += 1
 
     def _hold(self, held: Held, t: float, opening: float) -> None:
-        """Samples wait while it may be letting go."""
-        if opening < held.grip.held - self.swing:  # it had only paused
+        """While held, samples wait if it may be letting go."""
+        if opening < held.grip.held - self.swing:  # the closing had only paused
             self.refused, self.known = self.grips.pop(), held.start
         elif self.closing and opening <= held.grip.width:
             self._wide, self.known = math.nan, t
@@ -319,7 +316,7 @@ class Opening(Closings):
                 held.stop, self.known = self._wide, t
 
     def refuse(self) -> None:
-        """The grip that lasts turns out to hold nothing."""
+        """The current grip turns out to hold nothing."""
         self.refused = self.grips.pop()
         t, opening, _ = self._way[-1]
         self._restart(t, opening)

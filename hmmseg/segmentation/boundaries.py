@@ -1,18 +1,18 @@
-"""Where between two samples a contact changed: crossings in continuous time, and posteriors of boundaries.
+"""Continuous-time contact changes between two samples, and posteriors of boundaries.
 
-The alignment says in which sample interval a boundary lies. Within it the contact itself is a crossing:
-fingertips touch where the gap closes, a block lifts where the pads' shear force reaches its weight, meets its
-support where the shear force begins to fall below it, and is released where a pad's compression reaches zero.
+The alignment gives the sample interval of a boundary. Within it the contact itself is a crossing: fingertips
+touch when the gap closes; a block lifts when the pads' shear force reaches its weight, meets its support when
+the shear force starts to fall below it, and is released when a pad's compression vanishes.
 
-A crossing quantity g (a gap, a height over where the pads' shear carries a block) is known at both ends of a
-sample interval; forces give compressions far more finely than positions do. Smooth motion is the cubic that
-joins both ends with the measured velocities; its crossing time has the density of Rice's formula,
+A crossing quantity g (a gap, or a height above where the pads' shear carries the block) is known at both ends
+of a sample interval; forces give compressions far more precisely than positions do. Smooth motion follows the
+cubic that joins both ends with the measured velocities; the density of its crossing time is Rice's formula,
 
     p(t) ~ N(0; g(t), s(t)^2) E[max(dg/dt, 0)],
 
-s being the propagated sensor noise and the interpolation's own uncertainty (Rice 1944; docs/segmentation.md).
-Touches stop the motion: they come somewhere on the way of a minimum-jerk motion (Flash and Hogan 1985) whose
-start and duration both fingers share.
+where s combines the propagated sensor noise with the uncertainty of the interpolation (Rice 1944;
+docs/segmentation.md). Touches stop the motion: they occur during a minimum-jerk motion (Flash and Hogan 1985)
+whose start and duration are common to both fingers.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from hmmseg.tables import Brief
 
 POINTS = 41  # numerics: nodes per sample interval
 BEND = 0.015  # prior: bend that the cubic misses, as a share of interval x change of velocity
-UNSEEN = 0.15  # prior: the same, as a share of the way that the velocities at both ends do not account for
+UNSEEN = 0.15  # prior: the same, as a share of the displacement that both velocities do not explain
 LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
 MOTION, MOTIONS = (0.05, 1.0), 8  # prior: s; duration of the motion that an impact ends: log-uniform
 STARTS = 24  # numerics: nodes over the time at which that motion started
-SHAPE = 0.05  # prior: how far its speed may be off the minimum-jerk profile, as a share of it
+SHAPE = 0.05  # prior: relative deviation of its speed from the minimum-jerk profile
 STOP, STOPS = (0.002, 0.05), 10  # prior: s; time constant of the stop after an impact: log-uniform
 
 Kind = Literal["smooth", "impact", "launch"]
@@ -39,12 +39,12 @@ Kind = Literal["smooth", "impact", "launch"]
 
 @dataclass(frozen=True)
 class Crossing:
-    """A quantity [m] at both ends of a sample interval that crosses zero upwards inside it.
+    """A quantity [m] known at both ends of a sample interval that crosses zero upwards inside it.
 
-    `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise.
-    `kind`: "smooth" motion through the crossing; "impact": the crossing stops it (a touch, a
-    touchdown); "launch": it sets in with the crossing (a block that was held down lifts off).
-    `earlier`: how long before the left end [s] another sample was, its value and its rate.
+    `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise. `kind`: "smooth"
+    motion through the crossing; "impact": motion is stopped by it (a touch, a touchdown); "launch": motion
+    starts with it (a block that was held down lifts off). `earlier`: an earlier sample, as (time before the
+    left end [s], value, rate).
     """
 
     left: float
@@ -59,13 +59,13 @@ class Crossing:
 
     @property
     def known(self) -> bool:
-        """Whether no sample that it needs is missing."""
+        """Whether all required samples are present."""
         numbers = (self.left, self.right, self.v_left, self.v_right, self.sd_left, self.sd_right, self.sd_v)
         return bool(np.isfinite(numbers).all())
 
 
 def log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
-    """Rice's formula on the cubic that joins both ends, give or take a bend [m] amid them."""
+    """Log likelihood of a smooth crossing at u: Rice's formula on the cubic, give or take a bend [m]."""
     h00, h10, h01, h11 = 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u, -2 * u**3 + 3 * u**2, u**3 - u**2
     d00, d10, d01, d11 = 6 * u**2 - 6 * u, 3 * u**2 - 4 * u + 1, -6 * u**2 + 6 * u, 3 * u**2 - 2 * u
     value = h00 * c.left + h10 * h * c.v_left + h01 * c.right + h11 * h * c.v_right
@@ -79,10 +79,10 @@ def log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
 
 
 def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
-    """Probability (POINTS,) that every finger has hit by each node of an interval of h s.
+    """Probability (POINTS,) that all fingers have hit by each node of an interval of h s.
 
-    Fingers move as one, so that duration and start of the motion are marginalised for all of them together.
-    Distance, noise and stop are each finger's own.
+    The fingers move as one, so duration and start of the motion are marginalised jointly. Distance, noise and
+    stopping are each finger's own.
     """
     u = (np.arange(POINTS) + 0.5) / POINTS
     duration = np.geomspace(*MOTION, MOTIONS)[:, None, None]
@@ -103,19 +103,19 @@ def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
 
 
 def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phase: np.ndarray) -> np.ndarray:
-    """Log likelihood (..., POINTS) of an impact at u, given its motion.
+    """Log likelihood of an impact at u, ending a minimum-jerk motion.
 
-    A minimum-jerk motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample.
-    Its distance is unknown (log-uniform); gap and velocity of the first sample determine it. The face
-    that it hits is as likely in one place on its way as in another. After the hit the velocity
-    decays to v_right with an unknown time constant, which makes the compression `right`.
+    The motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample. Its distance is unknown
+    (log-uniform) and determined by gap and velocity of the first sample. The face that it hits is equally
+    likely anywhere along the way. After the hit the velocity decays to v_right with an unknown time constant,
+    which produces the compression `right`.
     """
     before, after = u * h, (1 - u) * h
     at_hit = phase + before / duration
     way = np.maximum(_minimum_jerk(at_hit) - _minimum_jerk(phase), 1e-9)
     rate, rate_at_hit = _minimum_jerk_slope(phase) / duration, _minimum_jerk_slope(at_hit) / duration
     gap, sd_v = -c.left, np.hypot(c.sd_v, SHAPE * max(c.v_left, -c.left / h))
-    # Each reading ~ N(distance share, sd), the distance integrated out: gap and speed, and those before.
+    # Each reading ~ N(distance x share, sd), distance integrated out: gap and speed, then earlier ones.
     readings = [(way, gap, c.sd_left), (rate, c.v_left, sd_v)]
     if c.earlier is not None:
         ago, value, speed = c.earlier
@@ -134,8 +134,7 @@ def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phas
     speed = np.maximum(distance * rate_at_hit, c.sd_v)
     stop = np.geomspace(*STOP, STOPS)[:, None, None, None]
     reach = stop * -np.expm1(-after / stop)
-    # What is left of `right`, but for its sign, when the velocity has decayed over this way; in place, as
-    # these are the largest arrays of a boundary.
+    # Negative residual of `right` after the velocity has decayed; in place, as these arrays are the largest.
     apart = reach * (speed - c.v_right)
     apart -= c.right - c.v_right * after
     variance = reach**2 * (2 * SHAPE * speed) ** 2
@@ -145,12 +144,12 @@ def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phas
 
 
 def _log_normal(x: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray) -> np.ndarray:
-    """Log density of a normal distribution but for a constant."""
+    """Log density of a normal distribution up to a constant."""
     return -0.5 * ((x - mean) / sd) ** 2 - np.log(sd)
 
 
 def _log_sum_normal(x: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Log of the sum along the first axis of normal densities, but for a constant; uses up its arguments."""
+    """Log of the sum over the first axis of normal densities, up to a constant; overwrites its arguments."""
     x *= x
     x /= variance
     x *= -0.5
@@ -172,11 +171,11 @@ def _minimum_jerk_slope(phase: np.ndarray | float) -> np.ndarray | float:
 
 
 def log_launch(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
-    """Log likelihood of a launch at u: a creep under load up to it, speed gained after it.
+    """Log likelihood of a launch at u: creep under load before, acceleration after.
 
-    Under load the fingers creep by -left at the load's own pace, of which v_left is a noisy early
-    reading; from there to v_right they gain speed with constant jerk, as minimum-jerk motions
-    set in, so that the gain covers a third of what full speed would, give or take LAUNCH.
+    Under load the fingers creep by -left at the pace of the load, of which v_left is a noisy early reading;
+    from then on they accelerate to v_right with constant jerk, as minimum-jerk motions start, so the distance
+    covered is a third of that at full speed, give or take LAUNCH.
     """
     before, after = u * h, (1 - u) * h
     creep = np.clip(-c.left / before, 0.0, max(c.v_right, c.sd_v))
@@ -186,19 +185,19 @@ def log_launch(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     return log_after + _log_normal(c.v_left, 0.75 * creep, np.hypot(c.sd_v, 0.25 * creep))
 
 
-ONSET = 0.001  # prior: s; a pad's force leads its compression by its viscosity, a few ms in foam
-UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, against what g leaves out
+ONSET = 0.001  # prior: s; viscosity lets a pad's force lead its compression, by a few ms in foam
+UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, for whatever g leaves out
 
 
 @dataclass(frozen=True, repr=False)
 class BoundaryPosterior(Brief):
-    """Posterior of one boundary: probabilities (M,) at times (M,) [s], increasing."""
+    """Posterior of one boundary: probabilities (M,) at increasing times (M,) [s]."""
 
     times: np.ndarray
     probabilities: np.ndarray
 
     def quantile(self, q: float) -> float:
-        """Time [s] below which the boundary lies with probability q."""
+        """Time [s] before which the boundary lies with probability q."""
         cumulative = np.cumsum(self.probabilities)
         middle = cumulative - self.probabilities / 2
         return float(np.interp(q, middle, self.times))
@@ -221,24 +220,23 @@ def normal(mean: float, sd: float) -> BoundaryPosterior:
 
 
 def crossing_density(crossings: list[Crossing], width: float) -> np.ndarray:
-    """Density (POINTS,) over an interval of `width` s of the time at which all have crossed.
+    """Density (POINTS,), summing to 1, of the time in an interval of `width` s at which all have crossed.
 
-    With several crossings (two fingers that touch) the boundary is the last of them. None at
-    all gives the uniform density. Sums to 1 over the nodes.
+    With several crossings (two fingers that touch) the boundary is the last of them; without any the density
+    is uniform.
     """
-    flat = np.full(POINTS, 1.0 / POINTS)
     if not crossings:
-        return flat
+        return np.full(POINTS, 1.0 / POINTS)
     if all(c.kind == "impact" for c in crossings):
         crossed = last_impact(crossings, width)
     else:
         crossed = np.prod([_crossed(c, width) for c in crossings], axis=0)
     last = np.diff(crossed, prepend=0.0)
-    return (1 - UNIFORM) * last / last.sum() + UNIFORM * flat
+    return (1 - UNIFORM) * last / last.sum() + UNIFORM * (1.0 / POINTS)
 
 
 def _crossed(c: Crossing, h: float) -> np.ndarray:
-    """Probability (POINTS,) that one crossing has happened by each node of an interval of h s."""
+    """Probability (POINTS,) that one crossing has occurred by each node of an interval of h s."""
     if c.kind == "impact":
         return last_impact([c], h)
     log_density = (log_smooth if c.kind == "smooth" else log_launch)(c, h, (np.arange(POINTS) + 0.5) / POINTS)
@@ -247,7 +245,7 @@ def _crossed(c: Crossing, h: float) -> np.ndarray:
 
 
 def first_of(crossings: list[Crossing], width: float) -> np.ndarray:
-    """Density (POINTS,) of the time at which the first of the crossings happens."""
+    """Density (POINTS,) of the time of the first crossing."""
     if not crossings:
         return crossing_density([], width)
     first = -np.diff(np.prod([1 - _crossed(c, width) for c in crossings], axis=0), prepend=1.0)
@@ -255,9 +253,9 @@ def first_of(crossings: list[Crossing], width: float) -> np.ndarray:
 
 
 def evenly(t: np.ndarray, interval_probability: np.ndarray) -> BoundaryPosterior:
-    """Boundary posterior from the probability (T-1,) of each interval, in which nothing more is known.
+    """Boundary posterior given the probability (T-1,) of each interval, uniform within intervals.
 
-    Intervals of probability below 1e-6 are left out.
+    Intervals of probability below 1e-6 are omitted.
     """
     u = (np.arange(POINTS) + 0.5) / POINTS
     likely = np.flatnonzero(interval_probability > 1e-6)
@@ -269,7 +267,7 @@ def evenly(t: np.ndarray, interval_probability: np.ndarray) -> BoundaryPosterior
 def blurred(
     times: np.ndarray, probabilities: np.ndarray, first: float, last: float, sd: float = ONSET
 ) -> BoundaryPosterior:
-    """The posterior widened by `sd` [s], by Gauss-Hermite nodes of a normal distribution."""
+    """The posterior convolved with a normal distribution of this `sd` [s], by Gauss-Hermite nodes."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(5)
     spread = np.clip(times[:, None] + sd * nodes, first, last).ravel()
     mass = (probabilities[:, None] * weights).ravel()

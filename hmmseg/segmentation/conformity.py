@@ -1,15 +1,15 @@
-"""Does a trial show its task? The task's order against contact states in any order.
+"""Conformity of a trial to its task: the task's order against contact states in any order.
 
-One hidden Markov model holds both: the chain of the task's subtasks, and the states of free_contacts, into
-which a path may leave the chain for good. P(leaving) is small (DEPARTURE), so that a trial counts as a
-misfit only where leaving gains more evidence than that (posterior odds above 1); the subtask that the path
-then does not reach is the one that fails. Ending before the last subtask, or starting outside of the first
-one, is leaving as well. Contacts ring and bounce for a while after each change, so every state is entered
-through settling stages (docs/segmentation.md).
+A single hidden Markov model contains both: the chain of the task's subtasks, and the states of
+`free_contacts`, for which a path may leave the chain for good. The probability of departure is small
+(DEPARTURE), so a trial is a misfit only if departing gains more evidence than that (posterior odds above 1);
+the failing subtask is then the one that the path does not reach. Ending before the last subtask, or starting
+outside the first, is a departure as well. Contacts ring and bounce for a while after each change, so every
+state is entered through settling stages (docs/segmentation.md).
 
-Of a trial that fails, the subtasks up to the failing one are reported and, counted back from the end, those
-that the recording's last runs still match (same contact state, same block). What lies between belongs to no
-subtask.
+For a misfit, the subtasks before the failing one are reported together with the final subtasks, counted from
+the end, that the last runs of the recording still match (same contact state, same block). Whatever lies in
+between belongs to no subtask.
 """
 
 from __future__ import annotations
@@ -34,28 +34,22 @@ from hmmseg.io.task import BlockTask
 from hmmseg.levels import MOVED, SETTLING
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from hmmseg.segmentation.emissions import Features, Parameters
-from hmmseg.segmentation.free_contacts import (
-    IMPOSSIBLE,
-    RINGING,
-    Block,
-    FreeContacts,
-    fit_free_contacts,
-    switching,
-)
+from hmmseg.segmentation.free_contacts import RINGING, Block, FreeContacts, fit_free_contacts, switching
 
 DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
-STAGES = 3  # prior: most of an Erlang law, in which a contact state settles
-BRIEF = 1e-8  # prior: to end before is less likely by this: a bounce is no grip, a halt in the air no place
+STAGES = 3  # prior: most stages of the Erlang distribution of settling times
+IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
+BRIEF = 1e-8  # prior: factor for leaving unsettled: a bounce is no grip, a halt in the air no place
 
 
 def column(free: FreeContacts, step: Subtask, assignment: dict[str, int | None]) -> int | None:
-    """Index in `free.states` of what a subtask looks like in one trial; None: it has no such block."""
+    """Index in `free.states` of the contact state of a subtask in one trial; None if its block is absent."""
     state = (step.state, None if step.state == FREE else assignment.get(str(step.object)))
     return free.states.index(state) if state in free.states else None
 
 
 def scored(free: FreeContacts, columns: Sequence[int | None]) -> np.ndarray:
-    """Log-likelihoods (num_timesteps, num_subtasks + num_states) of the chain and then the free states."""
+    """Log-likelihoods (num_timesteps, num_subtasks + num_states) of the chain, then of the free states."""
     n = len(free.table)
     chain = [np.full(n, IMPOSSIBLE) if c is None else free.table[:, c] for c in columns]
     return np.column_stack([*chain, free.table])
@@ -64,20 +58,20 @@ def scored(free: FreeContacts, columns: Sequence[int | None]) -> np.ndarray:
 def settled(
     free: FreeContacts, columns: Sequence[int | None], log_initial: np.ndarray, log_transition: np.ndarray
 ) -> tuple[np.ndarray, int, tuple[np.ndarray, np.ndarray]]:
-    """Log-likelihoods with all settling stages, their number, and the model (initial, transitions)."""
+    """Add settling stages: log-likelihoods, number of stages, and (log_initial, log_transition)."""
     stages = int(np.clip(round(SETTLING / free.interval / 2), 1, STAGES))
     settle = min(0.5, stages * free.interval / SETTLING)
     index = np.r_[[-1 if c is None else c for c in columns], np.arange(len(free.states))]
     table = scored(free, columns)
-    every = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
-    every[:, -1] = table
-    every[:, :-1] = _settling_table(table, index, free)[:, None]
-    # A block is released by fingers that open; a path that leaves may lose it.
+    staged = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
+    staged[:, -1] = table
+    staged[:, :-1] = _settling_table(table, index, free)[:, None]
+    # Within the task, fingers open to release a block; a path that departs may lose it.
     for i, c in enumerate(columns):
         if c is not None and i > 0 and free.states[c][0] == FREE:
-            every[:, 0, i] += free.opened[: len(table)]
+            staged[:, 0, i] += free.opened[: len(table)]
     model = _settling(log_initial, log_transition, stages, settle)
-    return every.reshape(len(table), -1), stages, model
+    return staged.reshape(len(table), -1), stages, model
 
 
 def departing(
@@ -85,7 +79,7 @@ def departing(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log initial and transition probabilities of the chain followed by the free states.
 
-    `leave`: probability per sample that a contact state ends.
+    `leave`: probability per sample of leaving a contact state.
     """
     k, num_states = len(columns), len(states)
     out = np.full((k + num_states, k + num_states), -np.inf)
@@ -96,27 +90,22 @@ def departing(
     for i, same in enumerate(columns):
         if same is not None:
             follows = np.isfinite(out[k + same, k:])
-            follows[same] = False  # to go on in the same state is not to leave
+            follows[same] = False  # staying in the same contact state is no departure
             out[i, k:][follows] = np.log(leave * DEPARTURE / max(follows.sum(), 1))
     initial = np.full(k + num_states, np.log(DEPARTURE / num_states))
-    initial[: k + 1] = -np.inf  # whatever is free motion at the start is the task's own
+    initial[: k + 1] = -np.inf  # initial free motion always belongs to the task
     initial[0] = np.log1p(-DEPARTURE)
     return initial, out
-
-
-def leaving(num_subtasks: int, n: int) -> float:
-    """Probability per sample that a contact state ends: as many of them as the task has."""
-    return min(0.5, num_subtasks / n)
 
 
 def _settling(
     log_initial: np.ndarray, log_transition: np.ndarray, stages: int, settle: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Every state stages + 1 times: it is entered in the first and settled in the last.
+    """Replicate every state stages + 1 times: entered in the first stage, settled in the last.
 
-    A stage passes to the next with `settle` per sample, so that durations are Erlang rather than
-    geometric; before the last, leaving the state has BRIEF of its probability. A recording starts
-    settled. Log initial and transition probabilities over (stages, states).
+    A stage passes to the next with probability `settle` per sample, so durations are Erlang rather than
+    geometric; before the last stage, leaving the state is BRIEF times as likely. Recordings start settled.
+    Returns log initial and log transition probabilities over (stages, states).
     """
     same = np.eye(log_initial.size, dtype=bool)
     stay, move = np.where(same, log_transition, -np.inf), np.where(same, -np.inf, log_transition)
@@ -131,9 +120,9 @@ def _settling(
 def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) -> np.ndarray:
     """Log-likelihoods (num_timesteps, num_states) while a contact settles.
 
-    Fingers and block ring for a while after any contact change. What the forces of a ringing sample
-    do says which block is held, but not how: every hold of it scores as the likeliest of them. Fingers that
-    have just released a block ring in the air.
+    Fingers and block ring for a while after any contact change. The forces of a ringing sample identify the
+    held block but not how it is held, so every hold of that block scores as the likeliest of them. Fingers
+    that have just released a block ring in the air.
     """
     out = table.copy()
     blocks = np.array([-1 if block is None else block for _, block in free.states])
@@ -146,19 +135,19 @@ def _settling_table(table: np.ndarray, columns: np.ndarray, free: FreeContacts) 
     return out
 
 
-ENDING = 1e-3  # prior: and that its recording stops before the task's end
+ENDING = 1e-3  # prior: probability that the recording stops before the task ends
 # cited: s; no new grip begins before a slip is felt (Johansson and Westling, Exp. Brain Res. 66, 1987)
 LAPSE = 0.074
-MAX_ASSIGNMENTS = 24  # numerics: tried at most
-MANY = 20  # learned: trials; of more than these one alone does not sway what most have learned
+MAX_ASSIGNMENTS = 24  # numerics: most assignments tried
+MANY = 20  # learned: trials; with more than this no single trial sways the consensus
 BETWEEN_TRIALS = 2.0  # prior: slack of like blocks: poses, pads and cables shift widths and weights as well
 
 
 @dataclass(frozen=True)
 class Run:
-    """Samples [start, stop) of a path in one state: its contact state and the trial's own block.
+    """Samples [start, stop) of a path in one contact state, with the trial's own block.
 
-    `subtask` is the index in the task, None once the trial has left its task.
+    `subtask` is its index in the task, None once the path has departed.
     """
 
     state: str
@@ -170,13 +159,13 @@ class Run:
 
 @dataclass(frozen=True)
 class Conformity:
-    """How far a trial follows its task.
+    """Whether and how far a trial follows its task.
 
-    `failing` is the index of the first subtask that it does not show, None where it shows all.
-    `log_odds`: log posterior odds of leaving the task against completing it (nats; the prior's are
-    about log(K DEPARTURE)); `log_evidence` is that of both together. `assignment` gives each object
-    its block in `free.blocks`, None for one that the trial does not show. `wrong_rise` [m]: how far
-    the object of the failing subtask went up between pickup and place, where that is what fails.
+    `failing` is the index of the first missing subtask, None if all are present. `log_odds`: log posterior
+    odds of departing from the task against completing it (nats; the prior's are about log(K DEPARTURE));
+    `log_evidence` covers both hypotheses. `assignment` maps each object to its block in `free.blocks`, None
+    if the trial does not show it. `wrong_rise` [m]: rise of the failing subtask's object from pickup to
+    place, where that rise is the failure.
     """
 
     free: FreeContacts
@@ -188,17 +177,17 @@ class Conformity:
     wrong_rise: float | None = None
 
     def block(self, name: str) -> Block | None:
-        """The trial's own block that stands for an object of the task."""
+        """The block of this trial that represents an object of the task."""
         index = self.assignment.get(name)
         return None if index is None else self.free.blocks[index]
 
 
 def examine(features: Sequence[Features], tasks: Sequence[BlockTask]) -> list[Conformity]:
-    """Conformity of every trial; `tasks` have the same moves, each from where its trial starts.
+    """Conformity of every trial; `tasks` have the same moves, each starting from its trial's initial state.
 
-    `features` need no more than emissions' MAX_RATE: contact states last longer than its samples.
+    `features` need no more than emissions' MAX_RATE, since contact states outlast its samples.
 
-    Each trial is judged by its own parameters; what most others have learned of the blocks then
+    Each trial is judged with its own parameters; the consensus of the other trials about the blocks then
     tells whether it moved the same ones.
     """
     steps = subtasks(tasks[0])
@@ -216,7 +205,7 @@ def examine(features: Sequence[Features], tasks: Sequence[BlockTask]) -> list[Co
 
 
 def _consensus(others: Sequence[Conformity]) -> dict[str, Block]:
-    """Median width and weight per object where most of at least two other trials agree."""
+    """Median width and weight per object on which most of at least two other trials agree."""
     out = {}
     for name in others[0].assignment if len(others) > 1 else ():
         blocks = [b for c in others if (b := c.block(name)) is not None]
@@ -230,14 +219,14 @@ def _consensus(others: Sequence[Conformity]) -> dict[str, Block]:
     return out
 
 
-def _differ(own: Block | None, known: Block) -> bool:
-    return own is None or not own.like(known, BETWEEN_TRIALS)
+def _differ(block: Block | None, usual: Block) -> bool:
+    return block is None or not block.like(usual, BETWEEN_TRIALS)
 
 
 def _check_rises(f: Features, c: Conformity, steps: tuple[Subtask, ...], task: BlockTask) -> Conformity:
-    """The verdict, with blocks put down on the wrong side of where they were picked up.
+    """Fail blocks that were placed on the wrong side, up or down, of where they were picked up.
 
-    One such move was put in another place; several are other blocks than the task's from the start.
+    One such move is a wrong place; several are wrong blocks from the start.
     """
     wrong = []
     for move, rise in height_equations(task):
@@ -260,10 +249,10 @@ def _check_rises(f: Features, c: Conformity, steps: tuple[Subtask, ...], task: B
 def conformity(
     free: FreeContacts, steps: tuple[Subtask, ...], known: dict[str, Block] | None = None
 ) -> Conformity:
-    """Compare the task's order with the alternative.
+    """Compare the task's order with free contact states.
 
-    Which of the trial's blocks is which object is the assignment of highest evidence among all
-    tried (the first with which the trial fits, if any), unless `known` blocks say it.
+    Tries the assignments of blocks to objects and takes the first that fits, otherwise the one of highest
+    evidence. `known` blocks fix the assignment of their objects.
     """
     ways, fixed, found = assignments(free, steps), dict[str, int | None](), []
     for name, block in (known or {}).items():  # the nearest of the trial's that may be it, if any
@@ -274,7 +263,7 @@ def conformity(
         c = _compare(free, steps, assignment)
         while c.failing is not None and (lost := _lapses(c)):
             table, ringing, opened = c.free.table.copy(), c.free.ringing.copy(), c.free.opened.copy()
-            for span in lost:  # these samples say nothing
+            for span in lost:  # treated as uninformative
                 table[span], ringing[span], opened[span] = 0.0, 0.0, 0.0
             unread = replace(c.free, table=table, ringing=ringing, opened=opened)
             c = _compare(unread, steps, assignment)
@@ -285,9 +274,9 @@ def conformity(
 
 
 def _lapses(c: Conformity) -> list[slice]:
-    """Samples in which a departure has a grip lose its block for too brief a moment to grip again.
+    """Samples at which a departing path loses a gripped block too briefly for a new grip.
 
-    From the first of them to the last it was lost for sure. Those that were left out before say nothing.
+    Samples that were discarded before count as no loss.
     """
     out = []
     for before, lost, after in zip(c.runs, c.runs[1:], c.runs[2:], strict=False):
@@ -299,10 +288,10 @@ def _lapses(c: Conformity) -> list[slice]:
 
 
 def assignments(free: FreeContacts, steps: Sequence[Subtask]) -> list[dict[str, int | None]]:
-    """Assignments of the task's objects to the trial's blocks, likeliest first, MAX_ASSIGNMENTS at most.
+    """Assignments of the task's objects to the trial's blocks, likeliest first, at most MAX_ASSIGNMENTS.
 
-    Distinct ones as long as there are enough blocks, else all blocks are some object's. First as the trial
-    grips them, one after the other, and as if it had one grip more, or one less, than the task; then any.
+    Injective if there are enough blocks, otherwise every block is assigned to some object. First in the order
+    of the trial's grips, one by one, allowing for one extra or one missing grip; then any.
     """
     names = list(dict.fromkeys(str(s.object) for s in steps if s.object is not None))
     numbers, count = range(len(free.blocks)), len(names)
@@ -326,9 +315,9 @@ def assignments(free: FreeContacts, steps: Sequence[Subtask]) -> list[dict[str, 
 def _as_gripped(
     free: FreeContacts, steps: Sequence[Subtask], names: Sequence[str]
 ) -> Iterator[tuple[int, ...]]:
-    """Blocks of the objects (num_objects,) as they are held when it is their turn.
+    """Blocks of the objects (num_objects,), matching grips to moves in order.
 
-    Objects whose turn never comes are the blocks that are left, if any is.
+    Objects that are never gripped get the remaining blocks, if any.
     """
     moved = [str(then.object) for s, then in itertools.pairwise(steps) if s.state == FREE != then.state]
     gripped = free.gripped
@@ -349,22 +338,22 @@ def _as_gripped(
 def _compare(free: FreeContacts, steps: tuple[Subtask, ...], assignment: dict[str, int | None]) -> Conformity:
     n, num_subtasks = len(free.table), len(steps)
     columns = [column(free, s, assignment) for s in steps]
-    leave = leaving(num_subtasks, n)
+    leave = min(0.5, num_subtasks / n)  # as many changes as the task has subtasks
     table, stages, model = settled(free, columns, *departing(free.states, columns, leave))
     num_states = num_subtasks + len(free.states)
     last = np.arange(num_states) == num_subtasks - 1
     table[-1, np.tile(np.arange(num_states) < num_subtasks - 1, stages + 1)] += np.log(ENDING)
-    table[-1, : stages * num_states] += np.log(ENDING)  # to end amid a change of contact is rare
+    table[-1, : stages * num_states] += np.log(ENDING)  # recordings rarely end amid a contact change
 
-    def ending(in_these: np.ndarray) -> np.ndarray:
-        every = table.copy()
-        every[-1, ~np.tile(in_these, stages + 1)] = -np.inf
-        return every
+    def ending_in(states: np.ndarray) -> np.ndarray:
+        conditioned = table.copy()
+        conditioned[-1, ~np.tile(states, stages + 1)] = -np.inf
+        return conditioned
 
-    log_left, log_complete = (dense.log_evidence(ending(ends), *model) for ends in (~last, last))
+    log_left, log_complete = (dense.log_evidence(ending_in(ends), *model) for ends in (~last, last))
     failing = None
     if log_left > log_complete:
-        runs = _runs(dense.viterbi(ending(~last), *model).path % num_states, steps, free, columns)
+        runs = _runs(dense.viterbi(ending_in(~last), *model).path % num_states, steps, free, columns)
         failing = min(sum(r.subtask is not None for r in runs), num_subtasks - 1)
     else:
         chain = scored(free, columns)[:, :num_subtasks]
@@ -396,10 +385,10 @@ PHRASES = {
 
 @dataclass(frozen=True)
 class Plan:
-    """The order that a misfit trial shows, as steps to align it with.
+    """The order that a misfit actually shows, as steps for its alignment.
 
-    The first `num_before` steps are the task's first; the last `num_after` its last. `start` are
-    the alternative's parameters under the names that the steps give to blocks.
+    The first `num_before` steps are the task's first, the last `num_after` its last. `start`: parameters of
+    the free contact states, under the object names used by the steps.
     """
 
     steps: tuple[Subtask, ...]
@@ -409,12 +398,12 @@ class Plan:
 
 
 def plan(c: Conformity, steps: tuple[Subtask, ...]) -> Plan:
-    """The order shown by a trial that fails."""
+    """Order shown by a misfit."""
     failing = c.failing
     if failing is None:
         raise ValueError("the trial fits its task")
     runs = list(c.runs)
-    if c.wrong_rise is not None:  # other blocks or places than the task's: nothing after is the task's
+    if c.wrong_rise is not None:  # wrong block or place: nothing from there on belongs to the task
         runs = [replace(r, subtask=None) if r.subtask is None or r.subtask >= failing else r for r in runs]
     before = sum(r.subtask is not None for r in runs)
     after = 0 if c.wrong_rise is not None else _matching(runs[before:], steps[failing + 1 :], c)
@@ -441,22 +430,22 @@ def plan(c: Conformity, steps: tuple[Subtask, ...]) -> Plan:
 
 
 def _matching(runs: Sequence[Run], tail: Sequence[Subtask], c: Conformity) -> int:
-    """How many of the last runs match the task's last subtasks."""
+    """Number of final runs that match the final subtasks of the task."""
     count = 0
     for run, step in zip(reversed(runs), reversed(tail), strict=False):
         expected = None if step.state == FREE else c.assignment.get(str(step.object))
         if run.state != step.state or run.block != expected:
             break
         count += 1
-    return count if count > 1 else 0  # free motion alone says nothing of which release it is
+    return count if count > 1 else 0  # free motion alone does not tell which release it is
 
 
 def task_boundaries(
     shown: Plan, found: Sequence[BoundaryPosterior], num_subtasks: int, first: float, last: float
 ) -> tuple[BoundaryPosterior, ...]:
-    """The task's boundaries from those of the order shown.
+    """Boundaries of the task, given those of the order shown.
 
-    The failing subtask takes all that belongs to none; missing ones after it have no length.
+    The failing subtask spans everything that belongs to no subtask; missing ones after it have zero length.
     """
     every, length = [at(first), *found, at(last)], len(shown.steps)  # every[i] is where step i starts
     back = (min(num_subtasks - k, shown.num_after) for k in range(1, num_subtasks))
@@ -464,14 +453,14 @@ def task_boundaries(
 
 
 def at(t: float) -> BoundaryPosterior:
-    """A boundary that is known to be at t [s]."""
+    """A boundary known to be at t [s]."""
     return BoundaryPosterior(np.array([t]), np.array([1.0]))
 
 
 def explain(c: Conformity, steps: tuple[Subtask, ...], starts: Sequence[float]) -> str:
-    """Why the failing subtask is not there, in plain words.
+    """Why the failing subtask is missing, as a sentence for people.
 
-    `starts` [s]: when each step of the order shown starts.
+    `starts` [s]: start of each step of the order shown.
     """
     if c.failing is None:
         raise ValueError("the trial fits its task")

@@ -1,20 +1,20 @@
 """Emissions of the contact states of a two-finger grip, from the physics of each state.
 
-Per sample the features are the four fingertip forces, the mean velocity (vx, vy), the height y
-and the distance d of the fingers. With g = (fx1 - fx2) / 2 the grip and fy the net vertical force:
+The features of a sample are the four fingertip forces, the mean velocity (vx, vy) and height y of the
+fingers, and their distance d. With the grip force g = (fx1 - fx2) / 2 and the net vertical force fy:
 
-- free motion: every force is its sensor bias, but for the moments at which one finger alone
-  touches (the grip begins when the second touches and ends when the first lets go); motion is free.
-- hold on ground: grip is positive, the support carries the rest, so fy <= weight; the block
-  rests, so vx = vy = 0 and y - fy / (2 k_s) (pads' shear deflection taken out) stays at one level.
+- free motion: all forces equal their sensor bias, except while a single finger touches (the grip begins when
+  the second finger touches and ends when the first lets go); motion is free.
+- hold on ground: the grip is positive and the support carries the rest, so fy <= weight; the block rests, so
+  vx = vy = 0 and y - fy / (2 k_s), the height without the pads' shear deflection, is constant.
 - sliding on ground: the same with vx free.
-- hold above ground: grip is positive and fy = weight (1 + a_y / gravity); motion is free.
-- in every grip the fingers are the block's width apart, less what the pads give:
+- hold above ground: the grip is positive and fy = weight (1 + a_y / gravity); motion is free.
+- in every grip the fingers are the block's width apart, less the give of the pads:
   d = width - (fx1 - fx2) / k_n.
 
-Free quantities have broad densities over the range the recording shows, so that all states
-score the same features and log-likelihoods compare. Residuals are Student-t (transients).
-Derivation and sources: docs/segmentation.md.
+Free quantities have broad densities over the range of the recording, so that all states score the same
+features and their log-likelihoods compare. Residuals are Student-t, for transients. Derivation and sources:
+docs/segmentation.md.
 """
 
 from __future__ import annotations
@@ -31,26 +31,25 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
-from hmmseg.robust import white_sd
+from hmmseg.robust import median_of_known, white_sd
 from hmmseg.tables import Brief
 
-STRAY = 0.02  # prior: share of resting samples that move for a moment (a grip settling, a bounce)
-TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's (foam giving late)
-STILL = 0.1  # prior: share of a carry's samples at which the block is held still
-ONE_FINGER = 0.02  # prior: share of free samples at which one finger alone touches
+STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
+TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's width (foam giving late)
+STILL = 0.1  # prior: share of carry samples at which the block is held still
+ONE_FINGER = 0.02  # prior: share of free samples at which only one finger touches
 RUNG = 0.01  # prior: share of free samples at which forces still ring from a contact
 
 
 @dataclass(frozen=True, repr=False)
 class Features(Brief):
-    """What the emissions score, arrays (num_timesteps,), NaN where missing.
+    """Features scored by the emissions, arrays (num_timesteps,), NaN where missing.
 
-    `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N]; vx, vy, ay: mean velocity and vertical
-    acceleration of the fingers; y: mean height [m]; d: distance of the fingers [m];
-    `pads`: their nominal compliances [m/N].
-    `span` holds the ranges of the broad densities (vx, vy [m/s], y, d [m], force of a
-    finger and press of both downwards [N]). `free`: 1 where a gripper's opening says that nothing is held,
-    None where forces alone are known.
+    `force` (num_timesteps, 4): fx1, fy1, fx2, fy2 [N]; vx, vy, ay: mean velocity and vertical acceleration of
+    the fingers; y: mean height [m]; d: distance of the fingers [m]; `sd_*`: noise of one sample; `pads`:
+    nominal compliances [m/N]. `span`: ranges of the broad densities (vx, vy [m/s], y, d [m], force of one
+    finger and downward press of both [N]). `free`: 1 where a gripper's opening shows that nothing is held;
+    None if only forces are known.
     """
 
     t: np.ndarray
@@ -75,11 +74,11 @@ class Features(Brief):
         return (self.force[:, 0] - self.force[:, 2]) / 2
 
     def block_width(self, bias: np.ndarray) -> np.ndarray:
-        """Width of what is held (num_timesteps,) [m]; as if rigid where a force is missing."""
+        """Width of the held block (num_timesteps,) [m]; with rigid pads where a force is missing."""
         return block_width(self.d, *_pair(self.force - bias, 0, 2), self.pads)
 
     def block_y(self, bias: np.ndarray) -> np.ndarray:
-        """Height of what is held (num_timesteps,) [m]; as if rigid where a force is missing."""
+        """Height of the held block (num_timesteps,) [m]; with rigid pads where a force is missing."""
         return block_y(self.y, *_pair(self.force - bias, 1, 3), self.pads)
 
     @cached_property
@@ -89,24 +88,24 @@ class Features(Brief):
 
     @cached_property
     def carrying(self) -> np.ndarray:
-        """Net vertical force on a lifted block in units of its weight (num_timesteps,)."""
+        """Net vertical force on a lifted block, in units of its weight (num_timesteps,)."""
         return carried_force(1.0, np.nan_to_num(self.ay), self.gravity)
 
 
 def _pair(force: np.ndarray, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
-    """Both fingers' forces (num_timesteps,), 0 where either is missing."""
+    """Forces of both fingers (num_timesteps,), 0 where either is missing."""
     there = np.isfinite(force[:, first] + force[:, second])
     return np.where(there, force[:, first], 0.0), np.where(there, force[:, second], 0.0)
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """What the emissions learn from the recording.
+    """Parameters of the emissions, learned from the recording.
 
-    `bias` (4,) [N]; `weight` [N] and `width` [m] per object (no width: not known yet). `scale`
-    holds the scales of the Student-t residuals: "force" in free motion, "carry" (net vertical force
-    while carried), "net_x" and "shear" while held [N], "velocity" [m/s] and "level" [m] while held
-    on the ground, "width" [m]. `levels` [m] per trial and subtask.
+    `bias` (4,) [N]; `weight` [N] and `width` [m] per object (absent while unknown). `scale`: scales of the
+    Student-t residuals: "force" in free motion, "carry" (net vertical force while carried), "net_x" and
+    "shear" while held [N], "velocity" [m/s] and "level" [m] while held on the ground, "width" [m]. `levels`
+    [m]: resting heights per trial and subtask.
     """
 
     bias: np.ndarray
@@ -115,14 +114,18 @@ class Parameters:
     width: dict[str, float] = field(default_factory=dict)
     levels: tuple[dict[int, float], ...] = ()
 
+    def force_sd(self, s: Signals) -> float:
+        """Noise of one force of a trial [N]: stated, or as learned in free motion."""
+        return self.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+
 
 def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.ndarray,
                  broad_up: np.ndarray, stray: float) -> np.ndarray:  # fmt: skip
-    """Log density of the motion of a block on its support: at rest, pushed aside, or astray altogether.
+    """Log density of the motion of a supported block: at rest, pushed aside, or straying altogether.
 
-    `aside`, `upward`: log densities of vx (None: it slides), and of vy and the height together, at rest;
-    `broad_*`: of strays. Height and velocity stray together: if each strayed by itself, a block held still in
-    the air would pay for its height and win the velocity's narrow density at every sample.
+    `aside`, `upward`: log densities at rest of vx (None: sliding), and of vy with the height; `broad_*`: of
+    strays. Height and velocity stray together: if they strayed separately, a block held still in the air
+    would pay for its height once, yet gain the narrow velocity density at every sample.
     """
     astray = np.log(stray) + broad_aside + broad_up
     if aside is None:
@@ -132,10 +135,10 @@ def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.n
 
 
 def _log_halting(f: Features, p: Parameters) -> np.ndarray:
-    """Log density of velocities and height of a block held still in the air, over that of one that moves.
+    """Log density ratio of velocities and height of a block held still in the air to one that moves.
 
-    Without it, a halt would pass for a rest on something, as that predicts the motion so much better. A block
-    that halts is where it was at the sample before; its height counts where that of blocks at rest does.
+    Without it, a halt would pass for a rest on something, which predicts the motion much better. A block that
+    halts stays where it was at the previous sample; its height counts if those of resting blocks do.
     """
     out = np.zeros(f.t.size)
     for name, v, sd in (("vx", f.vx, f.sd_vx), ("vy", f.vy, f.sd_vy)):
@@ -151,9 +154,9 @@ def _log_halting(f: Features, p: Parameters) -> np.ndarray:
 
 
 def _log_ungripped(force: np.ndarray, scale: float, span: float, rung: float) -> np.ndarray:
-    """Log density of forces (num_timesteps, 4) without a grip: no contact, one finger's, or what rings.
+    """Log density of forces (num_timesteps, 4) without a grip: no contact, one finger touching, or ringing.
 
-    How loud a contact rings is not known: amplitudes from `scale` to `span` are alike by their logarithm.
+    The amplitude of ringing is unknown: log-uniform from `scale` to `span`.
     """
     silent = log_student(force, scale)
     fingers = silent[:, :2].sum(axis=1), silent[:, 2:].sum(axis=1)
@@ -162,15 +165,12 @@ def _log_ungripped(force: np.ndarray, scale: float, span: float, rung: float) ->
         for sign, c in ((1.0, 0), (-1.0, 2))
     ]
     loud = np.log(2 * np.log1p(span / scale)) + np.log(np.abs(force) + scale)
-    ways = [np.log(rung) - np.nansum(loud, axis=1)] if rung else []
-    return np.logaddexp.reduce(
-        [
-            *ways,
-            np.log1p(-ONE_FINGER - rung) + fingers[0] + fingers[1],
-            np.log(ONE_FINGER / 2) + touching[0] + fingers[1],
-            np.log(ONE_FINGER / 2) + fingers[0] + touching[1],
-        ]
-    )
+    return np.logaddexp.reduce([
+        *([np.log(rung) - np.nansum(loud, axis=1)] if rung else []),
+        np.log1p(-ONE_FINGER - rung) + fingers[0] + fingers[1],
+        np.log(ONE_FINGER / 2) + touching[0] + fingers[1],
+        np.log(ONE_FINGER / 2) + fingers[0] + touching[1],
+    ])  # fmt: skip
 
 
 def log_likelihoods(
@@ -183,14 +183,19 @@ def log_likelihoods(
 ) -> np.ndarray:
     """Emission log-likelihoods (num_timesteps, num_subtasks) of one trial.
 
-    `stray`: share of resting samples that move; `rung`: of free samples whose forces still ring.
-    What subtasks have in common is computed once: a task has many of few contact states.
+    Args:
+        features: of the trial.
+        subtasks: in order; those with the same contact state, object and level are computed once.
+        parameters: of the emissions; without `levels`, resting heights are unknown.
+        trial: its index in `parameters.levels`.
+        stray: share of resting samples that move.
+        rung: share of free samples whose forces still ring.
     """
     scale, span = parameters.scale, features.span
     force = features.force - parameters.bias
     free = _log_ungripped(force, scale["force"], span["force"], rung)
     free = free + _broad(features, "vx", "vy") + _broad(features, "y") + _broad(features, "d")
-    # Of the forces that press a block between the fingers, but for the net vertical one.
+    # All forces of a grip but the net vertical one.
     held = log_between((force[:, 0] - force[:, 2]) / 2, 0.0, span["force"], scale["force"])
     if features.free is not None:
         held += EDGE * (features.free == 1)
@@ -198,22 +203,22 @@ def log_likelihoods(
     held = held + (log_student(net_x, scale["net_x"]) + log_student(shear, scale["shear"]))
     names = dict.fromkeys(str(s.object) for s in subtasks if s.state != FREE)
     grips = {name: held + _log_width(features, parameters, name) for name in names}
-    # Contact state, object and resting level [m]: what the emission of a subtask depends on.
+    # The emission of a subtask depends on its contact state, object and resting level [m].
     keys: list[tuple[str, str, float | None]] = []
     for s in subtasks:
         rests = s.state not in (FREE, ABOVE_GROUND) and bool(parameters.levels)
         level = parameters.levels[trial].get(s.index) if rests else None
         keys.append((s.state, "" if s.state == FREE else str(s.object), level))
-    found = {
+    columns = {
         key: free if key[0] == FREE
         else _log_gripped(features, parameters, grips[key[1]], force, *key, stray=stray)
         for key in dict.fromkeys(keys)
     }  # fmt: skip
-    return np.stack([found[key] for key in keys], axis=1)
+    return np.stack([columns[key] for key in keys], axis=1)
 
 
 def _broad(f: Features, *names: str) -> np.ndarray:
-    """Log density (num_timesteps,) of quantities that may be anything; 0 where missing."""
+    """Log density (num_timesteps,) of unconstrained quantities; 0 where missing."""
     parts = [-np.log(f.span[name]) * np.isfinite(getattr(f, name)) for name in names]
     return parts[0] if len(parts) == 1 else parts[0] + parts[1]
 
@@ -221,7 +226,7 @@ def _broad(f: Features, *names: str) -> np.ndarray:
 def _log_width(f: Features, p: Parameters, name: str) -> np.ndarray:
     """Log density of the fingers' distance with an object between them."""
     width = p.width.get(name)
-    if width is None:  # the first pass knows neither widths nor where a block rests
+    if width is None:  # widths and resting levels are unknown in the first pass
         return _broad(f, "d")
     residual = f.block_width(p.bias) - width
     close = np.log1p(-TOUCHING) + log_student(residual, np.hypot(f.sd_d, p.scale["width"]))
@@ -233,9 +238,9 @@ def _log_gripped(
     f: Features, p: Parameters, grip: np.ndarray, force: np.ndarray,
     state: str, name: str, level: float | None, stray: float,
 ) -> np.ndarray:  # fmt: skip
-    """Log-likelihoods (num_timesteps,) of one held object in one contact state, resting at this `level`.
+    """Log-likelihoods (num_timesteps,) of one held object in one contact state, resting at `level` [m].
 
-    `grip`: log density of what presses it, `force`: without biases.
+    `grip`: log density of the gripping forces; `force`: without biases.
     """
     fy, weight, scale = force[:, 1] + force[:, 3], p.weight[name], p.scale
     if state == ABOVE_GROUND:
@@ -245,33 +250,39 @@ def _log_gripped(
     out = grip + log_between(fy, -f.span["press"], weight, scale["carry"])
     aside = None if state == SLIDING else log_student(f.vx, np.hypot(f.sd_vx, scale["velocity"]))
     upward, broad_up = log_student(f.vy, np.hypot(f.sd_vy, scale["velocity"])), _broad(f, "vy")
-    if level is None:  # where it rests is not known
+    if level is None:
         out += _broad(f, "y")
     else:
         risen = f.block_y(p.bias) - level
         upward += log_student(risen, np.hypot(f.sd_y, scale["level"]))
-        broad_up = broad_up + log_student(risen, MOVED)  # what bounces or slips stays near
+        broad_up = broad_up + log_student(risen, MOVED)  # a block that bounces or slips stays near
     return out + _log_resting(aside, upward, _broad(f, "vx"), broad_up, stray)
 
 
-MAX_RATE = 40.0  # chosen: Hz; faster recordings are read at this rate, fast enough for a hand
-WINDOW = 6e-3  # chosen: s over which such a reading is averaged; a contact changes no faster
+MAX_RATE = 40.0  # chosen: Hz; faster recordings are thinned to this rate, fast enough for a hand
+WINDOW = 6e-3  # chosen: s over which a reading is averaged; contacts change no faster
 
 
 def noise_sd(values: np.ndarray) -> float:
-    """Robust standard deviation of white sample noise; NaN where too few samples are there."""
-    there = values[np.isfinite(values)]
-    return float(white_sd(there)) if there.size > 2 else np.nan
+    """Robust standard deviation of white sample noise; NaN for fewer than three samples."""
+    finite = values[np.isfinite(values)]
+    return float(white_sd(finite)) if finite.size > 2 else np.nan
+
+
+def channel_sd(stated: np.ndarray, values: np.ndarray) -> float:
+    """Noise of a channel: the median of the `stated` sds, or else estimated from its values."""
+    sd = median_of_known(stated)
+    return noise_sd(values) if np.isnan(sd) else sd
 
 
 def thin(
     signals: Signals, max_rate: float = MAX_RATE, window: float = np.inf, rate: float | None = None
 ) -> Signals:
-    """Signals read at a rate of at most `max_rate` [Hz], each reading a mean over up to `window` s.
+    """Thin signals to at most `max_rate` [Hz], each reading a mean over up to `window` s.
 
-    White noise of a mean over m samples shrinks by sqrt(m); readings without a value stay missing.
-    A short window keeps what changes within a reading apart. `rate` [Hz]: of the recording that the signals
-    are a piece of; their own median otherwise.
+    White noise of a mean over m samples shrinks by sqrt(m); readings without a value stay missing. A short
+    window resolves changes within a reading. `rate` [Hz]: of the recording if `signals` are a part of it,
+    otherwise their own median rate.
     """
     rate = float(1.0 / np.median(np.diff(signals.t))) if rate is None else rate
     group = group_size(rate, max_rate)
@@ -287,7 +298,7 @@ def thin(
 
 
 def acceleration(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Mean acceleration over the neighbouring samples [m/s^2]; NaN where it cannot be had."""
+    """Mean acceleration over neighbouring samples [m/s^2]; NaN where undefined."""
     out, there = np.full_like(velocity, np.nan), np.flatnonzero(np.isfinite(velocity))
     if there.size > 2:
         out[there] = np.gradient(velocity[there], t[there])
@@ -295,13 +306,13 @@ def acceleration(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
 
 
 def features(signals: Signals, rig: Rig) -> Features:
-    """Features of one trial; noise the rig does not state is learned from the recording."""
+    """Features of one trial; noise that the rig does not state is estimated from the recording."""
     s, root2 = signals, np.sqrt(2.0)
 
     def stated(sd: np.ndarray, values: np.ndarray) -> np.ndarray:
-        known = np.isfinite(sd)  # not where a sample is missing, whose own does not matter
-        usual = np.median(sd[known]) / root2 if known.any() else max(noise_sd(values), 1e-9)
-        return np.where(known, sd / root2, usual)
+        given = np.isfinite(sd)  # NaN at missing samples, whose noise does not matter
+        usual = np.median(sd[given]) / root2 if given.any() else max(noise_sd(values), 1e-9)
+        return np.where(given, sd / root2, usual)
 
     force = np.stack([s.fx1, s.fy1, s.fx2, s.fy2], axis=1)
     span = {
@@ -321,16 +332,16 @@ def features(signals: Signals, rig: Rig) -> Features:
 
 
 def without(f: Features, spans: Sequence[tuple[float, float]]) -> Features:
-    """The features without what was measured in some stretches of time [s]: there they say nothing."""
-    out = np.zeros(f.t.size, bool)
+    """Features with the given time spans [s] blanked, so that they carry no information."""
+    blanked = np.zeros(f.t.size, bool)
     for start, end in spans:
-        out |= (f.t >= start) & (f.t <= end)
-    if not out.any():
+        blanked |= (f.t >= start) & (f.t <= end)
+    if not blanked.any():
         return f
-    blank = {name: np.where(out, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")}
-    return replace(f, force=np.where(out[:, None], np.nan, f.force), **blank)
+    channels = {name: np.where(blanked, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")}
+    return replace(f, force=np.where(blanked[:, None], np.nan, f.force), **channels)
 
 
 def _range(values: np.ndarray, least: float) -> float:
-    there = values[np.isfinite(values)]  # none at all where some joint is always missing
-    return max(float(np.ptp(there)), least) if there.size else least
+    finite = values[np.isfinite(values)]  # empty if some joint is always missing
+    return max(float(np.ptp(finite)), least) if finite.size else least

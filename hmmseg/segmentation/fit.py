@@ -1,8 +1,8 @@
 """Maximum likelihood of the contact emissions within the task's forced order, by EM.
 
-No threshold is the user's to choose: the start splits grip forces into two groups by Otsu's
-criterion, and EM (expectation over alignments, robust weighted updates) does the rest. Trials
-of one task are pooled: they share weights, biases and scales, not the resting levels.
+No threshold is left to the user: grip forces are split into two groups by Otsu's criterion for a start, and
+EM (expectation over alignments, robust weighted updates) does the rest. Trials of one task are pooled: they
+share weights, biases and scales, but not resting levels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hmmseg.tables import Brief
 
 @dataclass(frozen=True, repr=False)
 class Fit(Brief):
-    """Fitted emissions with the alignment posterior of every trial."""
+    """Fitted emissions and the alignment posterior of every trial."""
 
     parameters: Parameters
     posteriors: tuple[AlignmentPosterior, ...]
@@ -40,7 +40,7 @@ def otsu(values: np.ndarray) -> float:
 
 
 def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ...]) -> Parameters:
-    """A rough start: biases from ungripped samples, one weight from samples gripped and moving."""
+    """Rough initial parameters: biases from ungripped samples, one weight from gripped, moving ones."""
     force = np.concatenate([f.force for f in features])
     grip = np.concatenate([f.grip for f in features])
     speed = np.concatenate([np.hypot(f.vx, f.vy) for f in features])
@@ -54,7 +54,7 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
     lifted = fy[moving & np.isfinite(fy)]
     span = max(f.span["force"] for f in features)
     weight = max(float(np.median(lifted)) if lifted.size else 0.0, 3 * noise, 0.01 * span)
-    names = [str(s.object) for s in subtasks if s.state != FREE]  # in order: sums depend on it
+    names = [str(s.object) for s in subtasks if s.state != FREE]  # in order: sums round differently otherwise
     scale = {
         "force": max(noise, 1e-6), "carry": 0.3 * weight, "net_x": 0.1 * span, "shear": 0.1 * span,
         "velocity": 0.01, "level": 1e-3, "width": 1e-3,
@@ -69,22 +69,27 @@ def chain_of(shares: np.ndarray, length: int) -> Chain:
 
 
 def mean_shares(gammas: Sequence[np.ndarray]) -> np.ndarray:
-    """Posterior mean shares (num_subtasks,) that subtasks take of every trial, given state probabilities.
+    """Posterior mean shares (num_subtasks,) of time spent in each subtask, given state probabilities.
 
-    The prior is Dirichlet, of equal shares, and worth one trial.
+    The prior is a symmetric Dirichlet distribution worth one trial.
     """
     counts = np.sum([g.mean(axis=0) for g in gammas], axis=0)
     return (counts + 1.0 / counts.size) / (counts.sum() + 1.0)
 
 
-Model = tuple[Parameters, np.ndarray]  # emissions, and shares (S,) of the trials' time
+Model = tuple[Parameters, np.ndarray]  # of the emissions, and the subtasks' shares (S,) of a trial's time
 
 
 def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Parameters | None = None) -> Fit:
     """Fit emissions and durations to the given trials, pooled, within the forced order.
 
-    EM begins with `start`, or else with what `initial_parameters` makes of the trials.
-    Raises `hmmseg.hmm.chain.InfeasibleAlignment` where a trial is too short for its subtasks.
+    Args:
+        features: of each trial.
+        subtasks: in order.
+        start: initial parameters; those of `initial_parameters` by default.
+
+    Raises:
+        InfeasibleAlignment: a trial is too short for its subtasks.
     """
 
     def tables(model: Model) -> tuple[list[np.ndarray], list[Chain]]:
@@ -96,8 +101,8 @@ def fit(features: Sequence[Features], subtasks: tuple[Subtask, ...], start: Para
         return maximisation(features, subtasks, model[0], gammas), mean_shares(gammas)
 
     equal = np.full(len(subtasks), 1.0 / len(subtasks))
-    found = em((start or initial_parameters(features, subtasks), equal), tables, updated)
-    return Fit(found.model[0], found.alignments)
+    learned = em((start or initial_parameters(features, subtasks), equal), tables, updated)
+    return Fit(learned.model[0], learned.alignments)
 
 
 def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
@@ -109,7 +114,8 @@ def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
     free = every[:, states == FREE].sum(axis=1)
     above = every[:, states == ABOVE_GROUND].sum(axis=1)
     ground = every[:, np.isin(states, (ON_GROUND, SLIDING))].sum(axis=1)
-    bias = np.array([_location(force[:, c], free, old.scale["force"], old.bias[c]) for c in range(4)])
+    noise = old.scale["force"]
+    bias = np.array([_location(force[:, c], free, noise, old.bias[c]) for c in range(4)])
     unbiased = force - bias
     fy, net_x = unbiased[:, 1] + unbiased[:, 3], unbiased[:, 0] + unbiased[:, 2]
     shear = (unbiased[:, 1] - unbiased[:, 3]) / 2
@@ -119,25 +125,22 @@ def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
         columns = [i for i, s in enumerate(subtasks) if s.object == name and s.state == ABOVE_GROUND]
         gamma = every[:, columns].sum(axis=1)
         if gamma.sum() > 1:
-            found = _location(fy / factor, gamma, old.scale["carry"], old.weight[name])
-            weight[name] = max(found, 1e-3)
+            weight[name] = max(_location(fy / factor, gamma, old.scale["carry"], old.weight[name]), 1e-3)
             residual = np.where(gamma > 0.5, fy - weight[name] * factor, residual)
-    noise = old.scale["force"]
     scale = {
         "force": _scale(unbiased.ravel(), np.repeat(free, 4), noise, 1e-6),
         "carry": _scale(residual, above, old.scale["carry"], noise),
         "net_x": _scale(net_x, above + ground, old.scale["net_x"], noise),
         "shear": _scale(shear, above + ground, old.scale["shear"], noise),
     }
-    rest = _rest(features, subtasks, old, bias, gammas)
-    width, width_scale = _widths(features, subtasks, old, bias, every)
-    scale |= {"velocity": rest[0], "level": rest[1], "width": width_scale}
-    return Parameters(bias, weight, scale, width, rest[2])
+    scale["velocity"], scale["level"], levels = _rest(features, subtasks, old, bias, gammas)
+    width, scale["width"] = _widths(features, subtasks, old, bias, every)
+    return Parameters(bias, weight, scale, width, levels)
 
 
 def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Parameters,
             bias: np.ndarray, every: np.ndarray) -> tuple[dict[str, float], float]:  # fmt: skip
-    """Distance of the fingers per held object, pads' squeeze taken out, and its scale."""
+    """Width per held object, from the fingers' distance without the pads' squeeze, and its scale."""
     unsqueezed = np.concatenate([f.block_width(bias) for f in features])
     spread = float(np.hypot(features[0].usual["d"], old.scale["width"]))
     width, residuals, weights = {}, [], []
@@ -145,7 +148,7 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
         held = [i for i, s in enumerate(subtasks) if s.object == name and s.state != FREE]
         gamma = every[:, held].sum(axis=1)
         if not (np.isfinite(unsqueezed) & (gamma > 0)).any():
-            continue  # never held where the distance is known
+            continue  # never held at a known distance
         start = old.width.get(name) or weighted_median(unsqueezed, gamma)
         width[name] = _location(unsqueezed, gamma, spread, start)
         residuals.append(unsqueezed - width[name])
@@ -164,19 +167,19 @@ def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Para
     columns = [s.index for s in subtasks if s.state in (ON_GROUND, SLIDING)]
     for i, (f, gamma) in enumerate(zip(features, gammas, strict=True)):
         resting = f.block_y(bias)
-        found = {}
+        own = {}
         for k in columns:
             spread = np.hypot(f.usual["y"], old.scale["level"])
             if not (np.isfinite(resting) & (gamma[:, k] > 0)).any():
-                continue  # where the block rests is unknown
+                continue  # never at rest at a known height
             start = old.levels[i].get(k) if old.levels else None
             start = weighted_median(resting, gamma[:, k]) if start is None else start
-            found[k] = _location(resting, gamma[:, k], spread, start)
+            own[k] = _location(resting, gamma[:, k], spread, start)
             velocity.append(f.vy)
-            level.append(resting - found[k])
+            level.append(resting - own[k])
             weights.append(gamma[:, k])
-        levels.append(found)
-    if not weights:  # nothing rests on the ground where its height is known
+        levels.append(own)
+    if not weights:
         return old.scale["velocity"], old.scale["level"], tuple(levels)
     gamma = np.concatenate(weights)
     least_v = 0.3 * float(np.median(np.concatenate([f.sd_vy for f in features])))
@@ -201,7 +204,7 @@ def _location(values: np.ndarray, weights: np.ndarray, scale: float, start: floa
 
 
 def _scale(residual: np.ndarray, weights: np.ndarray, start: float, least: float) -> float:
-    """Weighted Student-t scale by iterative reweighting, with a weak pull towards `start`."""
+    """Weighted Student-t scale by iterative reweighting, weakly shrunk towards `start`."""
     keep = np.isfinite(residual)
     r2, w, variance = residual[keep] ** 2, weights[keep], start**2
     if w.sum() < 1e-6:

@@ -1,11 +1,10 @@
-"""The unconstrained alternative to a task: contact states in any order, fitted to one trial alone.
+"""Contact states in any order, fitted to one trial alone: the alternative to a task.
 
-States are free motion and, for every distinct block the trial shows (grips of like width and weight are one
-block), hold on ground, hold above ground and, where the task slides, sliding; any state may follow any
-other. Emissions are those of `hmmseg.segmentation.emissions`, but for two things: no resting levels (each
-hold would need its own), and a lifted block may also be held still, which must not pass for a rest on
-something. Fitted by Viterbi training from robust starts, so that an order forced on a trial that does not
-have it cannot spoil weights or widths.
+States are free motion and, for every distinct block of the trial (grips of similar width and weight are one
+block), hold on ground, hold above ground and, if the task slides, sliding; any state may follow any other.
+Emissions are those of `hmmseg.segmentation.emissions` without resting levels (each hold would need its own)
+and with lifted blocks that may be held still, which must not pass for resting on something. Fitted by Viterbi
+training from robust starts, so that an order which the trial does not follow cannot bias weights or widths.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ ENDS = 3  # numerics: samples of whose heights the median is a grip's height at 
 
 @dataclass(frozen=True)
 class Block:
-    """A block as one trial shows it: `width` [m] and `weight` [N] (NaN: never lifted)."""
+    """A block as seen in one trial: `width` [m] and `weight` [N] (NaN: never lifted)."""
 
     width: float
     weight: float
 
     def like(self, other: Block, slack: float = 1.0) -> bool:
-        """Whether both can be the same block: like widths, and weights where both are known.
+        """Whether both may be the same block: similar widths, and weights where both are known.
 
         `slack` multiplies the tolerances.
         """
@@ -47,13 +46,12 @@ class Block:
 
 
 def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
-    """Force biases (4,), force scale and which samples are gripped: a start from the grip force.
+    """Initial force biases (4,) [N], force noise [N] and gripped samples, from the grip force.
 
-    Otsu's split always finds two groups. They are free and gripped only where they lie far
-    apart in terms of noise; where the lower one carries force as well, all is gripped.
+    Otsu's split always returns two groups. They count as free and gripped only if they are far apart compared
+    with the noise; if the lower group carries force too, all samples are gripped.
     """
-    found = np.array([noise_sd(f.force[:, c]) for c in range(4)])
-    noise = max(median_of_known(found, 0.0), 1e-3 * f.span["force"])
+    noise = max(median_of_known(np.array([noise_sd(c) for c in f.force.T]), 0.0), 1e-3 * f.span["force"])
     grip = f.grip
     there = np.isfinite(grip)
     every = np.ones(grip.size, bool)
@@ -62,20 +60,20 @@ def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
     split = otsu(grip)
     low, high = grip[there & (grip <= split)], grip[there & (grip > split)]
     apart = high.size > 0 and np.median(high) - np.median(low) > SURE * noise
-    # Where one group alone is there, opposed forces far above the noise are a grip, others a bias.
+    # A single group of opposed forces far above the noise is a grip, anything else a bias.
     opposed = abs(median_of_known(f.force[:, 0] + f.force[:, 2], np.inf)) < 0.3 * np.median(grip[there])
     if np.median(low) > (0.3 * np.median(high) if apart else SURE * noise) and opposed:
         return np.zeros(4), noise, every
     threshold = np.median(low) + 0.25 * (np.median(high) - np.median(low)) if apart else np.inf
     held = filled(grip) > threshold
     free = f.force[~held]
-    bias = np.array([median_of_known(free[:, c], 0.0) for c in range(4)])
-    spread = np.array([NORMAL * median_of_known(np.abs(free[:, c] - bias[c]), np.nan) for c in range(4)])
+    bias = np.array([median_of_known(c, 0.0) for c in free.T])
+    spread = np.array([NORMAL * median_of_known(np.abs(c), np.nan) for c in (free - bias).T])
     return bias, max(median_of_known(spread, 0.0), noise), held
 
 
 def filled(values: np.ndarray) -> np.ndarray:
-    """Values with what is missing interpolated; zeros where all are."""
+    """Values with gaps interpolated; zeros if all are missing."""
     there = np.flatnonzero(np.isfinite(values))
     return np.interp(np.arange(values.size), there, values[there]) if there.size else np.zeros(values.size)
 
@@ -83,8 +81,8 @@ def filled(values: np.ndarray) -> np.ndarray:
 def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray, guessing: bool = False) -> tuple[Block, ...]:
     """Distinct blocks among the grips, each grip's width and weight by robust means.
 
-    What is weighed is what surely moves. Where its load is lost in noise no weight is known; if `guessing`
-    it is what that load seems to be, two standard errors at least.
+    Weights come from samples that surely move. A load lost in noise gives no weight or, if `guessing`, its
+    apparent value, at least two standard errors.
     """
     fy = f.force[:, 1] + f.force[:, 3] - bias[1] - bias[3]
     fx1, fx2 = (filled(f.force[:, c] - bias[c]) for c in (0, 2))
@@ -99,7 +97,7 @@ def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray, guessing: bool = 
         lifted = (fy / f.carrying)[span][_lifted(f, span, guessing)]
         lifted = lifted[np.isfinite(lifted)]
         weight = float(np.median(lifted)) if lifted.size > 2 else np.nan
-        # Of the median of n sums of two forces, whose standard error is sqrt(pi / 2) sqrt(2 / n) sds of one.
+        # Standard error of the median of n sums of two forces: sqrt(pi / 2) sqrt(2 / n) sds of one force.
         error = noise * np.sqrt(np.pi / max(lifted.size, 1))
         least = weight if guessing else 3 * error
         block = Block(width, max(weight, 2 * error) if weight >= least else np.nan)
@@ -112,12 +110,12 @@ def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray, guessing: bool = 
 
 
 def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
-    """Which samples of one grip, (stop - start,), are surely of a lifted block; if `guessing`, probably.
+    """Samples of one grip, (stop - start,), at which the block is surely lifted; if `guessing`, probably.
 
-    Whatever is lifted moves vertically; a block that is pushed or only gripped does not. Velocities
-    tell it where they are known and exact; heights, which last longer, tell it of poor recordings: far
-    from where the grip begins and from where it ends. A block that falls is where its grip ends, so that the
-    guess is what is far from where it begins.
+    Lifted blocks move vertically; blocks that are pushed or only gripped do not. Velocities show it where
+    they are known precisely; heights, which persist longer, show it in noisy recordings: samples far from the
+    heights at which the grip begins and ends. A block that falls is at its final height when the grip ends,
+    so a guess only asks for samples far from the initial height.
     """
     moving = np.abs(f.vy[span]) > SURE * f.sd_vy[span]
     height = filled(f.y)[span]
@@ -126,16 +124,13 @@ def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
     return moving | np.all([np.abs(height - end) > least for end in ends[: 1 if guessing else 2]], axis=0)
 
 
-STRAY = 1e-3  # prior: share of resting samples that move: contacts settle in states of their own here
-CLOSED = (
-    1e-3  # prior: share of blocks released where they stand by fingers that slide off them, without opening
-)
+STRAY = 1e-3  # prior: share of resting samples that move: settling contacts have states of their own here
+CLOSED = 1e-3  # prior: share of blocks released in place by fingers that slide off without opening
 RINGING = 0.1  # prior: share of samples that ring while a contact settles
-ROUNDS = 8  # numerics: of an iteration that settles sooner
-# cited: s; no touch that ends sooner can have been meant to lift: grip forces rise for about as long before a
-# lift as loads do in it, 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
+ROUNDS = 8  # numerics: most iterations; it converges sooner
+# cited: s; a shorter touch cannot have been meant as a lift: grip and load forces rise in turn before a lift,
+# taking 0.2 s together at the fastest (Johansson and Westling, Exp. Brain Res. 56, 1984)
 TAP = 0.2
-IMPOSSIBLE = -1e3  # numerics: log-likelihood of a state that the trial never shows
 
 States = tuple[tuple[str, int | None], ...]
 Trained = tuple[States, tuple[Block, ...], Parameters, np.ndarray, np.ndarray]
@@ -143,19 +138,18 @@ Trained = tuple[States, tuple[Block, ...], Parameters, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class FreeContacts:
-    """The fitted alternative: `table` (num_timesteps, num_states) of log-likelihoods of `states`.
+    """Fitted free contact states: log-likelihoods `table` (num_timesteps, num_states) of `states`.
 
-    Samples are `interval` s apart; `ringing` (num_timesteps,): log-likelihoods of free motion just after a
-    contact. A state is (contact state, number of its block in `blocks`; None in
-    free motion); `path` (num_timesteps,) is the most probable sequence of states. `opened` (num_timesteps,):
-    log-likelihoods of how far apart the fingers are, if they just released a block that stays where it is.
-    `taps` [s] are touches of a block before its grip: to the path they are free motion, in the table they say
-    nothing.
+    A state is (contact state, index into `blocks`; None in free motion); `path` (num_timesteps,) is the most
+    probable sequence of states, at samples `interval` s apart. `ringing` (num_timesteps,): log-likelihoods of
+    free motion just after a contact. `opened` (num_timesteps,): log-likelihoods of the fingers' distance if
+    they have just released a block that stays in place. `taps` [s]: touches of a block before its grip, which
+    are free motion in `path` and uninformative in `table`.
     """
 
     parameters: Parameters
     blocks: tuple[Block, ...]
-    states: tuple[tuple[str, int | None], ...]
+    states: States
     table: np.ndarray
     path: np.ndarray
     opened: np.ndarray
@@ -165,14 +159,14 @@ class FreeContacts:
 
     @property
     def gripped(self) -> list[int]:
-        """The block of each separate grip of the path, in order."""
+        """Block of each separate grip of the path, in order."""
         block = np.array([-1 if number is None else number for _, number in self.states])[self.path]
         begins = (block >= 0) & (np.r_[-1, block[:-1]] < 0)
         return [int(number) for number in block[begins]]
 
 
 def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
-    """Fit the alternative to one trial; `sliding`: whether the task has slides."""
+    """Fit free contact states to one trial; `sliding`: whether the task has slides."""
     bias, scale, held = ungripped(f)
     states, blocks, parameters, table, path = _likeliest(f, sliding, bias, scale, held)
     interval = float(np.median(np.diff(f.t)))
@@ -186,27 +180,27 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
 
 
 def _likeliest(f: Features, sliding: bool, bias: np.ndarray, scale: float, held: np.ndarray) -> Trained:
-    """The likelier of two fits: from what is sure of the blocks, and from what is guessed of them.
+    """The likelier of two fits: with certain block weights only, and with guessed ones.
 
-    Whether a block that could not be weighed for sure was carried is for the whole recording to say: a task
-    with a carry whose block has no weight would have no trial at all.
+    The whole recording decides whether a block that could not be weighed reliably was carried: with no weight
+    for it, every trial of a task with a carry would be a misfit.
     """
-    looks = [blocks_of(f, bias, held)]
-    if any(np.isnan(b.weight) for b in looks[0]):
-        looks.append(blocks_of(f, bias, held, guessing=True))
+    starts = [blocks_of(f, bias, held)]
+    if any(np.isnan(b.weight) for b in starts[0]):
+        starts.append(blocks_of(f, bias, held, guessing=True))
 
-    def evidence(fit: Trained) -> float:  # a width and a weight of each block paid for (Schwarz 1978)
+    def evidence(fit: Trained) -> float:  # penalised for each block's width and weight (Schwarz 1978)
         states, blocks, _, table, _ = fit
         num = len(blocks) + sum(np.isfinite(b.weight) for b in blocks)
         return dense.log_evidence(table, *_any_order(states, len(table))) - 0.5 * num * np.log(len(table))
 
-    return max((_trained(f, sliding, bias, scale, blocks) for blocks in looks), key=evidence)
+    return max((_trained(f, sliding, bias, scale, blocks) for blocks in starts), key=evidence)
 
 
 def _trained(
     f: Features, sliding: bool, bias: np.ndarray, scale: float, blocks: tuple[Block, ...]
 ) -> Trained:
-    """Viterbi training from these blocks: states, blocks, parameters, table and path."""
+    """Viterbi training started from these blocks: states, blocks, parameters, table and path."""
     span = f.span["force"]
     weights = [b.weight for b in blocks if np.isfinite(b.weight)]
     parameters = Parameters(bias, {}, {
@@ -221,18 +215,18 @@ def _trained(
             width={str(i): b.width for i, b in enumerate(blocks)},
         )
         states = _states(blocks, sliding)
-        # Without levels. No free sample may ring, but just after a contact: whoever holds what the task does
-        # not name would pass for that.
+        # No levels. Free motion rings only just after a contact, or holding an unnamed object would pass
+        # for ringing.
         table = log_likelihoods(f, _subtasks(states), replace(parameters, levels=()), 0, STRAY, rung=0.0)
         before, path = path, dense.viterbi(table, *_any_order(states, len(table))).path
         used = [i for i in range(len(blocks)) if any(states[k][1] == i for k in np.unique(path))]
         if not blocks or np.array_equal(path, before):
-            known = _unweighed(states, path, blocks)
-            if known is blocks:
+            unweighed = _unweighed(states, path, blocks)
+            if unweighed is blocks:
                 break
-            blocks, path = known, before[:0]
+            blocks, path = unweighed, before[:0]
             continue
-        if len(used) < len(blocks):  # a start that the model does not need
+        if len(used) < len(blocks):  # drop blocks that the path does not use
             blocks, path = tuple(blocks[i] for i in used), before[:0]
             continue
         onehot, learned = np.eye(len(states))[path], replace(parameters, levels=())
@@ -246,7 +240,7 @@ def _trained(
 
 
 def _unweighed(states: States, path: np.ndarray, blocks: tuple[Block, ...]) -> tuple[Block, ...]:
-    """Blocks without the weights of those never carried; what may be another by its width is that one."""
+    """Blocks without the weights of those never carried, merged with carried ones of like width."""
     carried = {states[k][1] for k in np.unique(path) if states[k][0] == ABOVE_GROUND}
     if all(i in carried or np.isnan(b.weight) for i, b in enumerate(blocks)):
         return blocks
@@ -259,24 +253,24 @@ def _unweighed(states: States, path: np.ndarray, blocks: tuple[Block, ...]) -> t
 
 
 def _opened(f: Features, states: States, path: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    """Log-likelihoods (num_timesteps,) of the fingers' distance, if they release what stays between them.
+    """Log-likelihoods (num_timesteps,) of the fingers' distance if they release a block that stays in place.
 
-    Pads that come off a block have been relaxed first: fingers are as far apart as it is wide. Where they are
-    no farther apart than while they held it, it has left them. Half of what pads give by the rig is enough,
-    as they may be stiffer. Over the density of any distance; 0 where nothing is known.
+    Pads relax before they leave a block, so the fingers are then as far apart as it is wide; if they are no
+    farther apart than while holding, the block has gone. Half the nominal give of the pads suffices, as they
+    may be stiffer. Relative to the density of any distance; 0 where nothing is known.
     """
     held = np.array([state != FREE for state, _ in states])[path]
     given = f.block_width(bias) - f.d
     least = np.full(f.t.size, -np.inf)
     for start, stop in runs(held):
-        known = slice(start, stop)
-        least[start:] = median_of_known(f.d[known], -np.inf) + median_of_known(given[known], 0.0) / 2
+        grip = slice(start, stop)
+        least[start:] = median_of_known(f.d[grip], -np.inf) + median_of_known(given[grip], 0.0) / 2
     chance = log_ndtr(np.where(np.isfinite(f.d), (f.d - least) / f.sd_d, np.inf))
     return np.logaddexp(np.log1p(-CLOSED) + chance, np.log(CLOSED))
 
 
 def _tapped(states: States, path: np.ndarray, interval: float, f: Features) -> list[slice]:
-    """Samples of touches too brief for a grip, of a block at rest that is gripped next.
+    """Samples of touches too brief for a grip, of a resting block that is gripped next.
 
     A touch lasts as long as it presses about as firmly as that grip.
     """
@@ -297,7 +291,7 @@ def _tapped(states: States, path: np.ndarray, interval: float, f: Features) -> l
 def switching(states: States, leave: float) -> np.ndarray:
     """Log transition probabilities that leave any state with probability `leave`.
 
-    Any state may follow but another block's: a block changes only through free motion.
+    Any state may follow, except those of another block, which is reached only through free motion.
     """
     block = np.array([-1 if b is None else b for _, b in states])
     allowed = (block[:, None] == block) | (block[:, None] < 0) | (block < 0)

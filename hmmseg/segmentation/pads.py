@@ -1,23 +1,24 @@
-"""Pads and timing as the recording shows them: compliance, and delay of force against position.
+"""Pads and timing as shown by the recording: compliance, and delay of forces against positions.
 
-Before a block is lifted and after it is set down it rests, so that the fingers' distance and height follow
-the pads alone (`hmmseg.contact.equations`). Within one such stretch
+Before a block is lifted and after it is set down it rests, so the fingers' distance and height follow the
+pads alone (`hmmseg.contact.equations`). Within one such stretch
 
     value(t - delay) = rest - compliance x load(t)
 
-with the distance and the summed grip forces, or the height and the net vertical force. Stated stiffnesses
-are a prior; the delay is common to all forces (a clock offset, a filter; foam's viscosity makes it lead by
-its damping over its stiffness). Each stretch gives a compliance of its own; how far these differ is the
-form error of a linear pad.
+for the distance and the summed grip forces, or the height and the net vertical force. Nominal stiffnesses are
+a prior; the delay is common to all forces (a clock offset, a filter; or, from foam's viscosity, a lead of its
+damping over its stiffness). Each stretch has a compliance of its own; their spread is the form error of a
+linear pad.
 
-While both fingers press, the pads give what the distance falls short of the block's width,
+While both fingers press, the pads are compressed by what the distance falls short of the block's width,
 
     load(t) = max(width - distance(t), 0) / compliance,
 
-from before the touch until after the release. A sensor that is late shows this `shift` s later, one with a
-first-order filter smoothed by a time `constant`. Distances are joined by cubic Hermite pieces with the
-measured speeds. So touches and releases, where load changes most, say most, and a filter differs from a
-delay by how sharp they are. Widths follow from each hold, the compliance is profiled under its prior.
+from before the touch until after the release. A late sensor reports this `shift` s later, one with a
+first-order filter smooths it with a time `constant`. Distances are joined by cubic Hermite pieces with the
+measured speeds. Touches and releases, where the load changes most, are thus the most informative, and the
+sharpness of the change distinguishes a filter from a delay. Widths follow from each hold; the compliance is
+profiled under its prior.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import SURE, TAIL, decisive
-from hmmseg.robust import NORMAL, median_of_known, robust_sd, weighted_median
-from hmmseg.segmentation.emissions import Parameters, noise_sd
+from hmmseg.robust import NORMAL, robust_sd, weighted_median
+from hmmseg.segmentation.emissions import Parameters, channel_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
     NONE,
@@ -49,30 +50,27 @@ from hmmseg.segmentation.stretches import (
     stretches,
 )
 
-STEP = 0.0025  # numerics: s; distances and filters are evaluated at such steps
-FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays of every hand: foams lead by some ms
-SHIFTS = np.arange(0.015, 0.301, 0.005)  # prior: s; delays of a sensor, alike
+STEP = 0.0025  # numerics: s; step at which distances and filters are evaluated
+FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays of any hand: foams lead by some ms
+SHIFTS = np.arange(0.015, 0.301, 0.005)  # prior: s; delays of a sensor, equally likely
 CONSTANTS = np.array([0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1])  # prior: s; of its filter, alike
 LEAD_SD = 0.003  # prior: s; of a delay that is not the sensor's: foams lead by a few ms at most
-LATE_HANDS = 0.007  # prior: share of hands whose forces come late by more
+LATE_HANDS = 0.007  # prior: share of hands whose sensors delay their forces
 ENOUGH = 24  # numerics: squeezes that determine a delay
-COMPLIANCES = np.geomspace(0.33, 3.0, 17)  # numerics: times what the rig says
-UNSTATED = np.geomspace(4e-5, 1.2e-3, 17)  # numerics: m/N; of pads that are said to be rigid
-LAW_SHARE, LAW_LEAD = (
-    0.05,
-    0.0015,
-)  # prior: share by which a pad's force is off its law, and s by which it leads
-HOLD = 0.75  # chosen: share of a squeeze's firmest load from which it holds its block
-FIRMEST = 0.95  # numerics: quantile
+COMPLIANCES = np.geomspace(0.33, 3.0, 17)  # numerics: multiples of the nominal compliance
+UNSTATED = np.geomspace(4e-5, 1.2e-3, 17)  # numerics: m/N; compliances of nominally rigid pads
+LAW_SHARE, LAW_LEAD = 0.05, 0.0015  # prior: relative deviation of a pad's force from its law, and lead [s]
+HOLD = 0.75  # chosen: share of a squeeze's firmest load above which the block is held
+FIRMEST = 0.95  # numerics: quantile of the loads
 SLOWEST_SD = 3e-5  # prior: m; noise of a distance that neither rig nor recording gives
 
 
 @dataclass(frozen=True)
 class Squeeze:
-    """One grip on a block at rest with the free motion before and after it, arrays (N,).
+    """One grip on a resting block, with the free motion before and after it, arrays (N,).
 
-    Times t [s], the fingers' distance [m] and its rate [m/s], the summed grip `load` [N], NaN where one
-    finger presses alone, and their noise.
+    Times t [s], the fingers' distance [m] and its rate [m/s], the summed grip `load` [N], NaN while only one
+    finger presses, and their noise.
     """
 
     t: np.ndarray
@@ -84,23 +82,22 @@ class Squeeze:
 
 
 def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | None:
-    """The squeeze between `start` and `end` [s]; None without samples enough."""
-    sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+    """The squeeze between `start` and `end` [s]; None if there are too few samples."""
+    sd = p.force_sd(s)
     one, two = s.fx1 - p.bias[0], -(s.fx2 - p.bias[2])
     alone = (np.maximum(one, two) > SURE * sd) & (np.minimum(one, two) <= SURE * sd)
     rate = np.gradient(s.distance, s.t) if s.derived else s.vx2 - s.vx1
     use = (s.t >= start) & (s.t <= end) & np.isfinite(one + two + s.distance + rate)
     if use.sum() < 6 or not (~alone & use).any():
         return None
-    stated = median_of_known(s.sd_x)
-    noise = np.sqrt(2.0) * (noise_sd(s.x1) if np.isnan(stated) else stated)
+    noise = np.sqrt(2.0) * channel_sd(s.sd_x, s.x1)
     noise, load = noise if noise > 0 else SLOWEST_SD, np.where(alone, np.nan, one + two)
     return Squeeze(s.t[use], s.distance[use], rate[use], load[use], noise, np.sqrt(2.0) * sd)
 
 
 @dataclass(frozen=True)
 class Lateness:
-    """How late forces are: `delay` [s], its sd, and whether it is the sensor's, and its filter's."""
+    """Delay of the forces: `delay` [s], its sd, whether it is the sensor's, and whether by a filter."""
 
     delay: float = 0.0
     sd: float = LEAD_SD
@@ -109,7 +106,7 @@ class Lateness:
 
 
 def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Lateness:
-    """The delay that forces show; the sensor's where a long one, or a filter, explains them better for sure.
+    """Delay of the forces; the sensor's if a long delay, or a filter, is decisively the better explanation.
 
     `prior`: mean and sd of the compliance of a pad [m/N], which is profiled.
     """
@@ -121,7 +118,7 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
     loads = [_loads(s, compliances) for s in squeezes]
 
     def profiled(values: np.ndarray, filtered: bool) -> np.ndarray:
-        """Log-likelihoods (len(values),) of shifts, or of a filter's time constants [s]."""
+        """Log-likelihoods (len(values),) of shifts, or of time constants of a filter [s]."""
         total = log_prior[:, None]
         for s, own in zip(squeezes, loads, strict=True):
             if filtered:
@@ -149,10 +146,10 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
 
 
 def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
-    """Loads [N], and their rates, (2, num_compliances, num_steps) at each STEP from the first sample on."""
-    there = np.nan_to_num(s.load)
-    holds = there >= HOLD * np.quantile(there, FIRMEST)
-    width = np.median(s.distance[holds] + compliances[:, None] * there[holds], axis=1, keepdims=True)
+    """Loads [N] and absolute rates, (2, num_compliances, num_steps), at each STEP from the first sample."""
+    load = np.nan_to_num(s.load)
+    holds = load >= HOLD * np.quantile(load, FIRMEST)
+    width = np.median(s.distance[holds] + compliances[:, None] * load[holds], axis=1, keepdims=True)
     clock = np.minimum(np.arange(s.t[0], s.t[-1] + STEP, STEP), s.t[-1])
     distance = _joined(s, clock)
     load = np.maximum(width - distance, 0.0) / compliances[:, None]
@@ -160,7 +157,7 @@ def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
 
 
 def _joined(s: Squeeze, clock: np.ndarray) -> np.ndarray:
-    """Distances [m] at times [s] of cubic Hermite pieces through the samples with their rates."""
+    """Distances [m] at times [s], on cubic Hermite pieces through the samples and their rates."""
     before = np.clip(np.searchsorted(s.t, clock, side="right") - 1, 0, s.t.size - 2)
     width = np.diff(s.t)[before]
     u = (clock - s.t[before]) / width
@@ -171,15 +168,15 @@ def _joined(s: Squeeze, clock: np.ndarray) -> np.ndarray:
 
 
 def _steps(clock: np.ndarray, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """The STEP before each time [s] since the first, and how far it is on the way to the next."""
+    """The STEP before each time [s] since the first, and its fraction of the way to the next."""
     place = np.minimum((clock / STEP).astype(int), num_steps - 2)
     return place, clock / STEP - place
 
 
 def _log_likelihood(s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace: np.ndarray) -> np.ndarray:
-    """Log-likelihoods (C, M) of the forces of one squeeze, given loads and their rates (C, N, M); Student-t.
+    """Log-likelihoods (C, M) of the forces of one squeeze, given loads and rates (C, N, M); Student-t.
 
-    What a distance's noise makes of a load counts where there is one.
+    The distance's noise contributes only to loads that press.
     """
     there = np.isfinite(s.load)
     load, pace = load[:, there], pace[:, there]
@@ -189,22 +186,21 @@ def _log_likelihood(s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace:
     return -DEPENDENT / 2 * ((TAIL + 1) * np.log1p(apart / TAIL) + np.log(variance)).sum(axis=1)
 
 
-# prior: of a stated stiffness, where the rig does not say: foams of one make differ by as much
-STIFFNESS_SD = 0.3
+STIFFNESS_SD = 0.3  # prior: relative sd of a stiffness if the rig gives none: foams of one make differ so
 RIGID = 2e-5  # chosen: m/N; a stiffer pad hides its compression from any force sensor
-SOFT = 2e-4  # prior: m/N; how far pads that are said to be rigid may give after all
-FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth so many stretches
-BETWEEN = 0.15  # prior: of a sample interval: forces read at other moments than their own samples'
-REACH = 0.4  # numerics: s; free motion before and after a hold that is used: the longest delay, and a touch
-LATE_SHARE = 0.1  # prior: of a delay: a filter of another order, a shift that is partly a filter
-LARGEST = 0.9  # chosen: quantile of what all contacts show, of friction or of ringing, that is the largest
+SOFT = 2e-4  # prior: m/N; sd of the compliance of nominally rigid pads
+FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth this many stretches
+BETWEEN = 0.15  # prior: share of a sample interval by which corrected forces may be off in time
+REACH = 0.4  # numerics: s of free motion used before and after a hold: the longest delay, and a touch
+LATE_SHARE = 0.1  # prior: relative error of a delay: a filter of another order, or a mixture with a shift
+LARGEST = 0.9  # chosen: quantile over all contacts that represents the largest friction, or ringing
 
 
 @dataclass(frozen=True)
 class Compliance:
-    """Compliance [m/N], its standard deviation, and the share by which one contact may differ from it.
+    """Compliance [m/N], its standard deviation, and its relative variation between contacts (`form`).
 
-    `toe` is what contacts give in addition when they are hardly pressed.
+    `toe`: additional give of hardly pressed contacts.
     """
 
     value: float
@@ -214,18 +210,18 @@ class Compliance:
 
     @property
     def doubt(self) -> float:
-        """Standard deviation as a share of it, at most all."""
+        """Relative standard deviation, at most 1."""
         return min(self.sd / self.value, 1.0) if self.value > 0 else 0.0
 
 
 @dataclass(frozen=True)
 class Sensing:
-    """What one hand's recordings show of its pads and of the delay of its forces.
+    """Pads and force delay of one hand, as its recordings show them.
 
-    `delay` [s] is of the forces (negative: they lead), `delay_sd` its standard deviation. Where it is the
-    sensor's (`late`), forces are to be read `delay` later, or, of a `filter`, undone. `friction` is the
-    largest ratio of shear to grip force observed on one finger's pad as it lets go. `rests` [m]:
-    how far heights of blocks at rest are off what the pads make of their loads.
+    `delay` [s] of the forces (negative: they lead) and its sd `delay_sd`. If it is the sensor's (`late`),
+    forces must be read `delay` later or, for a `filter`, unfiltered. `friction`: largest ratio of shear to
+    grip force observed on one pad as it lets go. `rests` [m]: residuals of the heights of resting blocks,
+    given their loads.
     """
 
     normal: Compliance
@@ -239,17 +235,17 @@ class Sensing:
 
     @property
     def pads(self) -> Pads:
-        """Both fingers alike."""
+        """Alike for both fingers."""
         return Pads(self.normal.value, self.normal.value, self.shear.value, self.shear.value)
 
     def heights_gain(self, other: Sensing) -> float:
-        """By how much [nats] heights of blocks at rest fit their loads better than in another reading."""
+        """Log-likelihood gain [nats] of the heights of resting blocks over another reading of the forces."""
         if not (self.rests.size and other.rests.size):
             return np.inf
         return DEPENDENT * self.rests.size * float(np.log(robust_sd(other.rests) / robust_sd(self.rests)))
 
     def remarks(self, rig: Rig) -> tuple[str, ...]:
-        """What the recording contradicts the rig in, for people."""
+        """Contradictions between recording and rig, for people."""
         out = []
         if self.late:
             how = "are filtered with a time constant of" if self.filter else "come late by"
@@ -263,7 +259,7 @@ class Sensing:
 
 
 def read_again(s: Signals, sensing: Sensing) -> Signals:
-    """The signals with forces brought forward by the delay, or with their filter undone."""
+    """Signals with the delay of the forces removed, or their filter undone."""
     if not sensing.late:
         return s
     forces, louder = {}, 1.0
@@ -279,10 +275,10 @@ def read_again(s: Signals, sensing: Sensing) -> Signals:
 
 
 def _unfiltered(t: np.ndarray, force: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
-    """Forces [N] without their first-order filter of this time `constant` [s], and how much louder they are.
+    """Forces [N] without their first-order filter of this time `constant` [s], and the noise gain.
 
-    (F_n - k F_(n-1)) / (1 - k), k the share that a sample interval h keeps, is a steady input, or one that
-    changes evenly as it was constant - h k / (1 - k) before: h / 2 where it is slow.
+    (F_n - k F_(n-1)) / (1 - k), where k is the share kept over a sample interval h, is a steady input, or a
+    steadily changing one at a time constant - h k / (1 - k) earlier: h / 2 for slow filters.
     """
     step = np.diff(t)
     kept = np.exp(-step / constant)
@@ -293,10 +289,11 @@ def _unfiltered(t: np.ndarray, force: np.ndarray, constant: float) -> tuple[np.n
 
 
 def limited(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Readings (num_samples,) at t [s] as they are `at` other times, NaN where the last is no neighbour.
+    """Readings (num_samples,) at t [s] evaluated `at` other times, NaN beyond the last.
 
-    Each is read from its nearest neighbour, with the lesser of the slopes on either side of that, if they
-    agree: a force that jumps is not smeared over the samples before (the minmod limiter; van Leer 1979).
+    Each is extrapolated from its nearest neighbour with the lesser of the slopes on either side, if they
+    agree in sign, so that a jump is not smeared over the samples before it (the minmod limiter; van Leer
+    1979).
     """
     slopes = np.diff(values) / np.diff(t)
     before, after = np.r_[slopes[:1], slopes], np.r_[slopes, slopes[-1:]]
@@ -313,8 +310,8 @@ def sense(
 ) -> Sensing:  # fmt: skip
     """Pads and delay from aligned recordings.
 
-    `again`: forces have been read again, so that no long delay is left. `paths`: per recording the times
-    [s] and subtasks (num_timesteps,) of its alignment.
+    `again`: the forces were re-read, so no long delay remains. `paths`: per recording the times [s] and
+    subtasks (num_timesteps,) of its alignment.
     """
     grips, loads, squeezes = list[Stretch](), list[Stretch](), list[Squeeze | None]()
     ratios, rings = list[float](), list[tuple[float, float, float]]()
@@ -337,9 +334,9 @@ def sense(
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
     timing, toe = lateness(felt, priors[0]), NONE
     lead = 0.0 if timing.late else timing.delay
-    if not again:  # forces that were late, or a wrist's, show no law so finely
+    if not again:  # corrected forces, or a wrist's, are too coarse for a toe
         toe = find([(*reading(s, lead), s.sd) for s in grips])
-        if toe is not NONE:  # what bends looks like what is late
+        if toe is not NONE:  # a toe explains an apparent delay
             grips, lead = [replace(s, toe=toe) for s in grips], 0.0
             timing = timing if timing.late else Lateness()
     normal, shear = (
@@ -364,7 +361,7 @@ def _prior(compliance: float, stated: float) -> tuple[float, float]:
 def _with_free_motion(
     t: np.ndarray, path: np.ndarray, steps: Sequence[Subtask], index: int
 ) -> tuple[float, float]:
-    """Ends [s] of a hold with the adjacent free motion: a touch may be earlier than its forces."""
+    """Ends [s] of a hold extended into adjacent free motion, as a touch may precede its forces."""
     ends = []
     for adjacent, end, way in ((index - 1, 0, -1), (index + 1, -1, 1)):
         near = float(t[np.flatnonzero(path == index)[end]])
@@ -378,12 +375,12 @@ def _compliance(
     readings: Sequence[tuple[np.ndarray, np.ndarray, float]], prior: tuple[float, float],
     ringing: float = 0.0,
 ) -> Compliance:  # fmt: skip
-    """Common compliance of all stretches, each with a rest of its own; `prior`: mean and sd [m/N].
+    """Common compliance of all stretches, each with its own rest; `prior`: mean and sd [m/N].
 
-    `ringing` [N]: noise that loads are known to have.
+    `ringing` [N]: known noise of the loads.
     """
-    found = np.array([_slope(*one, ringing) for one in readings]).reshape(-1, 3)
-    c, w, apart = found[found[:, 1] > 0].T
+    slopes = np.array([_slope(*one, ringing) for one in readings]).reshape(-1, 3)
+    c, w, apart = slopes[slopes[:, 1] > 0].T
     if not c.size:
         return Compliance(prior[0], prior[1], FORM)
     middle = weighted_median(c, w)
@@ -393,7 +390,7 @@ def _compliance(
     usual = FORM * max(abs(middle), prior[0])
     between = (c.size * between + FORM_STRETCHES * usual**2) / (c.size + FORM_STRETCHES)
     trusted = (TAIL + 1) / (TAIL + (c - middle) ** 2 / (1 / w + between)) / (1 / w + between)
-    # Where forces ring all stretches are off for one reason, which their number does not mend.
+    # Ringing biases all stretches alike, which no number of them averages out.
     seen = float(trusted @ c / trusted.sum())
     information = 1 / (1 / trusted.sum() + float(trusted @ apart / trusted.sum()) ** 2)
     total = information + prior[1] ** -2
@@ -402,10 +399,10 @@ def _compliance(
 
 
 def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tuple[float, float, float]:
-    """Compliance [m/N] of one stretch, its information, and what it is off by as others are.
+    """Compliance [m/N] of one stretch, its information, and its error in common with other stretches.
 
-    Loads that ring, by `ringing` [N] and maybe more, while nothing moves flatten the line of places over
-    loads, to none at the worst (`slope_between`).
+    Loads that ring, by at least `ringing` [N], while nothing moves flatten the line of places over loads, in
+    the worst case to zero (`slope_between`).
     """
     slope, weight = fitted(load, place, sd)
     if weight == 0:

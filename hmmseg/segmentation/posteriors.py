@@ -1,4 +1,4 @@
-"""Posteriors of an aligned trial's boundaries, from what finger and block show of each contact change."""
+"""Boundary posteriors of an aligned trial, from the contacts that change at each boundary."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, evenly, normal
 from hmmseg.segmentation.changes import DISCREPANCY, Change, Penetration, Prior, cut, moment
-from hmmseg.segmentation.emissions import WINDOW, Parameters, noise_sd
+from hmmseg.segmentation.emissions import WINDOW, Features, Parameters, channel_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
-from hmmseg.segmentation.spans import Span
+from hmmseg.segmentation.spans import Span, spans_between
 
 STIFFEST = 1e-7  # numerics: m/N
 
 
 @dataclass(frozen=True)
 class Contacts:
-    """Fingertip signals of one trial with what the fit knows: biases, weights, pads and noise.
+    """Fingertip signals of one trial, with the fitted biases, weights, pads and noise.
 
-    `compression` (2, T): each finger's pad compression by its force [m]; `inward` (2, T): its
-    position along its own closing direction [m]; `inward_rate` (2, 2, T): its rate just before and just
-    after each sample, by finger, `sinking` (2, T) that of the mean height downwards [m/s]; `deflection` (T,):
-    the pads' mean shear deflection by the net vertical force [m]; `tangential` (2, T): vertical forces [N].
+    `compression` (2, T): compression of each finger's pad, from its force [m]; `inward` (2, T): position
+    along the finger's closing direction [m]; `inward_rate` (2, 2, T): its rate just before and just after
+    each sample, by finger; `sinking` (2, T): that of the mean height, downwards [m/s]; `deflection` (T,):
+    mean shear deflection of the pads, from the net vertical force [m]; `tangential` (2, T): vertical forces
+    [N].
     """
 
     signals: Signals
@@ -46,7 +47,7 @@ class Contacts:
     def change(
         self, before: Subtask, after: Subtask, prior: Prior, held: tuple[float, float]
     ) -> Change | None:
-        """What is known of one boundary; None: these signals say nothing of it.
+        """Evidence about one boundary; None if these signals have none.
 
         `held` [s]: a stretch on the held side of the boundary in which the block rests or is held.
         """
@@ -69,10 +70,10 @@ class Contacts:
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool) -> Penetration:
-        """Finger i in its pad, against the face of the block, which is halfway to the other finger's."""
+        """Penetration of finger i past the face of the block, which is midway between both estimates."""
         inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
         face = median_of_known(inward[held] - self.compression[i, held])
-        # A pad of another stiffness would put the face elsewhere.
+        # An error of the pad's stiffness shifts the face.
         pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
         sd_inward = float(np.hypot(self.sd["inward"], self.sensing.normal.doubt * pressed))
         sd = self.sd["compression"]
@@ -83,7 +84,7 @@ class Contacts:
         ), making)  # fmt: skip
 
     def _slip(self, i: int, held: np.ndarray) -> float:
-        """Compression [m] at which finger i slides off a block that it has `held`: friction bears no more."""
+        """Compression [m] at which finger i slides off a block that it has `held`, as friction is spent."""
         if self.sensing.friction <= 0:
             return 0.0
         needed = np.abs(median_of_known(self.tangential[i, held])) / self.sensing.friction
@@ -102,17 +103,17 @@ class Contacts:
         ), making)  # fmt: skip
 
     def _timely(self, c: Penetration, making: bool) -> Penetration:
-        """The contact as its change would be seen without the forces' small delay, or lead.
+        """Correct a penetration for a small delay, or lead, of the forces.
 
-        A touch begins where the compression does, and so do both changes for a sensor that is late.
-        Foam that leads by its viscosity lets go where its force is spent: it recovers more slowly. How fast a
-        stiff pad is pressed only its force shows it: what its finger moves, it moves with the block.
+        A touch begins with the compression, and with a late sensor so does a release. Foam that leads by its
+        viscosity releases where its force is spent, as it recovers more slowly. A stiff pad moves with its
+        finger, so only its force shows how fast it is pressed.
         """
         rate = central_differences(c.t, c.pressed)[0] if c.hidden else c.rate.mean(axis=0)
         moved = self.sensing.delay * np.nan_to_num(rate)
         if not making and self.sensing.delay < 0:
             return replace(c, place=c.place - moved)
-        # What is farther apart than it moves within a reading has no compression to be late: its force rings.
+        # Where the gap exceeds the motion within a reading there is no compression: the force is ringing.
         meanwhile = np.abs(c.rate.mean(axis=0)) * (WINDOW + abs(self.sensing.delay))
         sure = (c.pressed > SURE * c.sd_apart) & ~(c.place < -SURE * c.sd_place - meanwhile)
         return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
@@ -124,19 +125,18 @@ def _compression(force: np.ndarray, sensing: Sensing) -> np.ndarray:
 
 
 def shown(pads: Pads) -> Pads:
-    """A pad too stiff to show its compression still shows its force, in whatever unit of length."""
+    """Compliances of at least STIFFEST, so that the force of a rigid pad still shows as a compression."""
     return Pads(*(max(float(c), STIFFEST) for c in pads))
 
 
 def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Contacts:
-    """Contacts of one trial; noise the rig does not state is learned from the recording."""
+    """Contacts of one trial; noise that the rig does not state is estimated from the recording."""
     s, bias, root2 = signals, parameters.bias, np.sqrt(2.0)
     normal = np.stack([s.fx1 - bias[0], -(s.fx2 - bias[2])])
     inward = np.stack([s.x1, -s.x2])
-    sd_x, sd_y = _sd(s.sd_x, s.x1), _sd(s.sd_y, s.y1)
+    sd_x, sd_y = channel_sd(s.sd_x, s.x1), channel_sd(s.sd_y, s.y1)
     rates, sinking, sd_vx, sd_vy = _rates(s, inward, sd_x, sd_y)
-    force = parameters.scale["force"] if np.isnan(s.sd_force) else s.sd_force
-
+    force = parameters.force_sd(s)
     pads, toe = shown(sensing.pads), sensing.normal.toe
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
@@ -158,20 +158,15 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     )  # fmt: skip
 
 
-def _sd(stated: np.ndarray, values: np.ndarray) -> float:
-    """Noise of a channel: as stated, or as the recording shows it."""
-    return float(np.nanmedian(stated)) if np.isfinite(stated).any() else noise_sd(values)
-
-
 def _rates(
     s: Signals, inward: np.ndarray, sd_x: float, sd_y: float
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Rates (2, 2, T) of closing and (2, T) of sinking, before and after each sample, and their noise [m/s].
 
-    Where velocities are differences of positions, each side has its own.
+    Velocities that are differences of positions have separate rates before and after.
     """
     if not s.derived:
-        closing, noise = np.stack([s.vx1, -s.vx2]), (_sd(s.sd_vx, s.vx1), _sd(s.sd_vy, s.vy1))
+        closing, noise = np.stack([s.vx1, -s.vx2]), (channel_sd(s.sd_vx, s.vx1), channel_sd(s.sd_vy, s.vy1))
         return np.stack([closing, closing]), np.stack([-s.vy, -s.vy]), *noise
     (left, noise), (right, _), (rising, _) = (one_sided(s.t, x) for x in (*inward, s.y))
     return np.stack([left, right], axis=1), -rising, noise * sd_x, noise * sd_y
@@ -181,19 +176,29 @@ INTERVAL = (0.05, 0.95)  # physics: a definition: the central 90 %
 Touches = tuple[tuple[float, float], ...]
 
 
+@dataclass(frozen=True)
+class Reading:
+    """One recording, or one round of it: `fine` signals to locate contacts, `thinned` ones to align.
+
+    `features` are those of `thinned`; `ends` [s]: first and last time of the recording.
+    """
+
+    fine: Signals
+    thinned: Signals
+    features: Features
+    ends: tuple[float, float]
+
+
 def contact_changes(
-    signals: Signals, thinned: Signals, sensing: Sensing, steps: tuple[Subtask, ...], parameters: Parameters,
+    reading: Reading, sensing: Sensing, steps: tuple[Subtask, ...], parameters: Parameters,
     posterior: AlignmentPosterior,
 ) -> list[Change | None]:  # fmt: skip
-    """What one trial shows of each of its boundaries; None where its signals say nothing of it.
-
-    `signals` are those that locate contacts, `thinned` those that were aligned.
-    """
-    t = thinned.t
+    """Evidence of one trial about each of its boundaries; None where its signals have none."""
+    t = reading.thinned.t
     path = posterior.smoothed.argmax(axis=1)
     last = np.searchsorted(path, np.arange(len(steps) - 1), side="right") - 1
     edges = [float(t[0]), *t[last], float(t[-1])]
-    table = contacts(signals, sensing, parameters)
+    table = contacts(reading.fine, sensing, parameters)
     out = []
     for k in range(len(steps) - 1):
         probability = posterior.moves[0][:, k]
@@ -204,36 +209,34 @@ def contact_changes(
 
 
 def boundary_posteriors(
-    changes: Sequence[Change | None], discrepancy: Mapping[tuple[Kind, int], float], t: np.ndarray,
-    posterior: AlignmentPosterior, touches: Touches = (),
+    reading: Reading, changes: Sequence[Change | None], discrepancy: Mapping[tuple[Kind, int], float],
+    posterior: AlignmentPosterior,
 ) -> tuple[BoundaryPosterior, ...]:  # fmt: skip
-    """Posterior of each boundary of one trial, aligned at t (num_timesteps,) [s].
-
-    `touches` [s]: times, and sds, of touches and releases known apart from forces.
-    """
-    found = []
+    """Posterior of each boundary of one aligned trial, given its contact `changes`."""
+    out = []
     for k, change in enumerate(changes):
         if change is None:
-            found.append(evenly(t, posterior.moves[0][:, k]))
+            out.append(evenly(reading.thinned.t, posterior.moves[0][:, k]))
         else:
-            posted = moment(change, discrepancy.get(change.sort, DISCREPANCY))
-            found.append(nearest_touch(touches, posted) if len(change.contacts) > 1 else posted)
-    return tuple(found)
+            boundary = moment(change, discrepancy.get(change.sort, DISCREPANCY))
+            touched = len(change.contacts) > 1
+            out.append(nearest_touch(reading.fine.touches, boundary) if touched else boundary)
+    return tuple(out)
 
 
-def nearest_touch(touches: Touches, found: BoundaryPosterior) -> BoundaryPosterior:
-    """The touch or release known apart from forces where there is one before a hand drifts, else as it is."""
-    middle = found.quantile(0.5)
+def nearest_touch(touches: Touches, boundary: BoundaryPosterior) -> BoundaryPosterior:
+    """Replace a boundary by the nearest of `touches`, (time, sd) [s], unless the hand may have drifted."""
+    middle = boundary.quantile(0.5)
     for time, sd in sorted(touches, key=lambda touch: abs(touch[0] - middle))[:1]:
-        if abs(time - middle) < max(DRIFTS, 3 * sd, 3 * found.sd):
+        if abs(time - middle) < max(DRIFTS, 3 * sd, 3 * boundary.sd):
             return normal(time, sd)
-    return found
+    return boundary
 
 
 def _held_side(
     t: np.ndarray, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
 ) -> tuple[float, float]:
-    """Stretch [s] nearest to interval n of the subtask that rests on the ground, before or after it."""
+    """Nearest stretch [s] to interval n of the subtask that rests on the ground, before or after it."""
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
     if after:
@@ -248,5 +251,4 @@ def to_spans(
     medians = np.maximum.accumulate([first, *(b.quantile(0.5) for b in boundaries), last]).tolist()
     sds = [0.0, *(b.sd for b in boundaries), 0.0]
     intervals = [(first, first), *(tuple(b.quantile(q) for q in INTERVAL) for b in boundaries), (last, last)]
-    ends = [each for pair in (medians, sds, intervals) for each in (pair[:-1], pair[1:])]
-    return tuple(Span(s.name, s.object, s.state, *rest) for s, *rest in zip(steps, *ends, strict=True))
+    return spans_between(steps, medians, sds, intervals)

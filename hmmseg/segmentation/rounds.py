@@ -1,8 +1,8 @@
-"""Repeated tasks: a recording is cut into its rounds, each of which is then a trial of one round.
+"""Repeated tasks: cut a recording into rounds, each then a trial of a single round.
 
-The task's chain closes on itself: from the free motion after its last move the next round may begin, and from
-wherever a path has left the chain as well, so that a round that fails does not carry the others away. One
-Viterbi path over the chain's few states finds the rounds, at a cost linear in the length of the recording
+The task's chain is closed: the next round may begin from the free motion after the last move, and also from
+any state reached by departing from the chain, so that a failing round does not spoil the others. One Viterbi
+path over the few states of the chain finds the rounds, at a cost linear in the length of the recording
 whatever their number. Long recordings are read from disk round by round.
 """
 
@@ -28,9 +28,9 @@ MARGIN = 64  # numerics: rows read on either side of a part, for differences of 
 
 
 class OnDisk:
-    """Signals read anew at each access.
+    """Signals that are read anew at every access.
 
-    Whether velocities come late is judged by its beginning: a drive does not change its habits.
+    Whether velocities are late is judged from the beginning, as a drive keeps its habits.
     """
 
     def __init__(self, recording: LongRecording, rig: Rig) -> None:
@@ -43,7 +43,7 @@ class OnDisk:
         return self.recording.t
 
     def read(self, start: int, stop: int) -> Signals:
-        """Signals of the samples from `start` to `stop`."""
+        """Signals of samples `start` to `stop`."""
         low, high = max(start - MARGIN, 0), min(stop + MARGIN, self.t.size)
         signals = task_space(self.recording.rows(low, high), self.rig)
         if self._late:
@@ -51,7 +51,7 @@ class OnDisk:
         return part(signals, slice(start - low, stop - low))
 
     def thinned(self) -> Signals:
-        """All of it, as `thin` has it."""
+        """The whole recording, thinned as by `thin`."""
         rate = self.recording.rate
         step = group_size(rate, MAX_RATE)
         size = max(self.recording.piece // step, 1) * step
@@ -64,7 +64,7 @@ class OnDisk:
 
 
 Recorded = Signals | OnDisk
-GLANCE = 4096  # numerics: samples that identify the recording's blocks with objects
+GLANCE = 4096  # numerics: samples used to match the recording's blocks with objects
 
 
 def one_round(task: BlockTask) -> BlockTask:
@@ -73,7 +73,7 @@ def one_round(task: BlockTask) -> BlockTask:
 
 
 def round_tasks(task: BlockTask, number: int) -> list[BlockTask]:
-    """The moves of each round as a task of its own, from where its blocks then stand."""
+    """Each round as a task of its own, starting from where the blocks then stand."""
     support, out = dict(task.initial), []
     for _ in range(number):
         out.append(BlockTask(dict(support), task.moves))
@@ -83,26 +83,27 @@ def round_tasks(task: BlockTask, number: int) -> list[BlockTask]:
 
 
 def cut(f: Features, task: BlockTask) -> list[float]:
-    """Times [s] amid the free motions between the rounds of one recording, in order.
+    """Times [s] within the free motions between the rounds of one recording, in order; none for one round.
 
-    `f` need no more than emissions' MAX_RATE. A recording without a second round has none.
+    `f` needs no more than emissions' MAX_RATE.
     """
     free = fit_free_contacts(f, any(move.slide for move in task.moves))
     steps = subtasks(one_round(task))
     leave = min(0.5, max(4 * len(free.gripped) + 1, len(steps)) / len(f.t))
-    ways = assignments(free, steps)
-    if len(ways) > 1:  # only the best one's table is made for the whole of a recording that may be long
+    candidates = assignments(free, steps)
+    best = 0
+    if len(candidates) > 1:  # the table of a long recording is large, so compare on its beginning
         glance = replace(free, table=free.table[:GLANCE])
-        tables = [_closed(glance, steps, each, leave) for each in ways]
-        ways = [ways[int(np.argmax([dense.log_evidence(table, *model) for table, model in tables]))]]
-    table, model = _closed(free, steps, ways[0], leave)
+        tables = [_closed(glance, steps, each, leave) for each in candidates]
+        best = int(np.argmax([dense.log_evidence(table, *model) for table, model in tables]))
+    table, model = _closed(free, steps, candidates[best], leave)
     num_states = len(steps) + len(free.states)
     path = dense.viterbi(table, *model).path % num_states
     states = np.array([s.state for s in steps] + [state for state, _ in free.states])
     open_ = (states == FREE)[path]
     begins = np.flatnonzero((path[1:] == 1) & open_[:-1]) + 1
     if begins.size and (~open_[: begins[0]]).any():
-        begins = np.r_[-1, begins]  # what is held before the first whole round is a round cut short
+        begins = np.r_[-1, begins]  # a block held before the first whole round is a truncated round
     cuts = []
     for begin in begins[1:]:
         held = np.flatnonzero(~open_[:begin])
@@ -114,12 +115,12 @@ def cut(f: Features, task: BlockTask) -> list[float]:
 def _closed(
     free: FreeContacts, steps: Sequence[Subtask], assignment: dict[str, int | None], leave: float
 ) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Log-likelihoods and model of the chain that restarts after its end, with its settling stages."""
+    """Log-likelihoods and model of the closed chain, which restarts after its end, with settling stages."""
     columns = [column(free, s, assignment) for s in steps]
     initial, transition = departing(free.states, columns, leave)
     k = len(steps)
     for i, step in enumerate(steps[:-1]):
-        if step.state == FREE and i > 0:  # a round broken off between two moves
+        if step.state == FREE and i > 0:  # a round abandoned between two moves
             transition[i, 1] = np.log(leave * DEPARTURE)
     transition[k - 1, 1] = np.log(leave)
     transition[k + free.states.index((FREE, None)), 1] = np.log(leave / 2)
@@ -128,7 +129,7 @@ def _closed(
 
 
 def slices(t: np.ndarray, cuts: Sequence[float]) -> list[slice]:
-    """Samples of each round, t (num_timesteps,) [s]."""
+    """Samples of each round, given t (num_timesteps,) [s]."""
     edges = [0, *np.searchsorted(t, cuts), t.size]
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
@@ -142,16 +143,16 @@ def part(recorded: Recorded, samples: slice) -> Signals:
 
 
 def merge_point(verdicts: Sequence[Conformity], times: Sequence[np.ndarray]) -> int | None:
-    """Which round to join with its next where there is one too many; None where all fit.
+    """Which round to merge with its successor if there is one too many; None if all fit.
 
-    Of rounds that fail, the one whose next grip follows soonest: a block that was gripped again.
-    `times` [s] are those of the samples that were judged.
+    Among failing rounds, the one whose next grip follows soonest: a block gripped again. `times` [s] are
+    those of the samples judged.
     """
     waits = {}
     for r in range(len(verdicts) - 1):
         if verdicts[r].failing is not None:
             held = [run for run in verdicts[r].runs if run.state != FREE]
             then = [run for run in verdicts[r + 1].runs if run.state != FREE]
-            let_go = times[r][held[-1].stop - 1] if held else times[r][0]
-            waits[r] = float((times[r + 1][then[0].start] if then else times[r + 1][-1]) - let_go)
+            released = times[r][held[-1].stop - 1] if held else times[r][0]
+            waits[r] = float((times[r + 1][then[0].start] if then else times[r + 1][-1]) - released)
     return min(waits, key=lambda r: waits[r], default=None)

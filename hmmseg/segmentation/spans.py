@@ -15,7 +15,7 @@ from hmmseg.tables import Tabled, listed
 
 @dataclass(frozen=True)
 class Place:
-    """A time [s] at which a boundary may lie, and the probability that it lies thereabouts."""
+    """A time [s] at which a boundary may lie, with the probability that it lies nearby."""
 
     time: float
     probability: float
@@ -23,7 +23,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Question:
-    """The one boundary of a trial whose label would decide most.
+    """The boundary of a trial whose label would be most informative.
 
     `subtask`: the one that begins there. `gain`: expected reduction of entropy [nats].
     """
@@ -35,12 +35,12 @@ class Question:
 
 @dataclass(frozen=True)
 class Span:
-    """One subtask's half-open interval [start, end) in s.
+    """Half-open interval [start, end) [s] of one subtask.
 
-    Start and end are posterior medians and may lie between samples; one span's end is the next
-    one's start. `*_sd` are posterior standard deviations [s], `*_90` central 90 % intervals [s]
-    (of width 0 at the recording's own first and last time). `alternatives`: all places where the start
-    may lie, most probable first; empty where there is but one.
+    Start and end are posterior medians and may lie between samples; the end of one span is the start of the
+    next. `*_sd`: posterior standard deviations [s]; `*_90`: central 90 % intervals [s] (of width 0 at the
+    first and last time of the recording). `alternatives`: all places where the start may lie, most probable
+    first; empty if there is only one.
     """
 
     subtask: str
@@ -56,7 +56,7 @@ class Span:
 
     @property
     def label(self) -> str:
-        """As `carry block1`."""
+        """Such as `carry block1`."""
         return labelled(self.subtask, self.object)
 
     def to_json(self) -> dict:
@@ -67,11 +67,20 @@ class Span:
         return document
 
 
+def spans_between(
+    steps: Sequence[Subtask], edges: Sequence[float], sds: Sequence[float],
+    intervals: Sequence[tuple[float, ...]],
+) -> tuple[Span, ...]:  # fmt: skip
+    """Spans of subtasks (num_steps) between edges [s] with their sds and intervals (num_steps + 1 each)."""
+    ends = [each for row in (edges, sds, intervals) for each in (row[:-1], row[1:])]
+    return tuple(Span(s.name, s.object, s.state, *rest) for s, *rest in zip(steps, *ends, strict=True))
+
+
 @dataclass(frozen=True)
 class Failure:
     """The first subtask (0-based index in the task's order) that the recording does not show.
 
-    `repetition` (from 1) says in which round of a repeated task; None where it has but one.
+    `repetition`: number, from 1, of the round of a repeated task; None for a single round.
     """
 
     index: int
@@ -82,7 +91,7 @@ class Failure:
 
     @property
     def label(self) -> str:
-        """As `carry block1`."""
+        """Such as `carry block1`."""
         return labelled(self.subtask, self.object)
 
     def __str__(self) -> str:
@@ -99,13 +108,13 @@ class Failure:
 
 @dataclass(frozen=True, repr=False)
 class Segmentation(Tabled):
-    """Spans of one trial; `failed` where the recording does not fit its task.
+    """Spans of one trial; `failed` if the recording does not fit its task.
 
-    `log_evidence` is None from a method that has no likelihood. Of a repeated task, `repetitions` says
-    how often the recording shows it and `failures` holds all rounds that do not fit, `failed` the first.
-    `recorded` is what `plot` shows: the signals of a block task's trial, the trial itself of a plain
-    ordered task. `remarks` say what the recording contradicts in the rig, or leaves open. `question`: the
-    label of this trial that would decide most, where its boundaries may lie elsewhere.
+    `log_evidence` is None for methods without a likelihood. For a repeated task, `repetitions` is the number
+    of rounds recorded and `failures` lists all failing rounds, `failed` being the first. `recorded` is what
+    `plot` draws: the signals of a block task's trial, or the trial itself for a plain ordered task. `remarks`
+    state what in the rig the recording contradicts or leaves open. `question`: the most informative label of
+    this trial, if its boundaries may lie elsewhere.
     """
 
     file: str
@@ -141,7 +150,7 @@ class Segmentation(Tabled):
         return document
 
     def to_pandas(self) -> Any:
-        """One row a subtask: name, object, state, start and end [s] with their uncertainty."""
+        """One row a subtask: name, object, state, start and end [s] with their uncertainties."""
         import pandas as pd
 
         return pd.DataFrame([span.to_json() for span in self.spans])
@@ -155,9 +164,9 @@ class Segmentation(Tabled):
         return str(self.failed or "")
 
     def plot(self, path: str | Path | None = None) -> list[Any]:
-        """Signals over the coloured subtasks; the axes, one a signal. Saved where a path is given.
+        """Plot signals over the coloured subtasks, and save the figure if a path is given; returns the axes.
 
-        ValueError where the segmentation does not keep what was recorded.
+        ValueError if the segmentation does not keep its recording.
         """
         if self.recorded is None:
             raise ValueError("this segmentation keeps no recording to plot")
@@ -168,22 +177,18 @@ class Segmentation(Tabled):
 
 
 def most_telling(segmentations: Sequence[Segmentation]) -> Question | None:
-    """The one label, over all trials, that would decide most; None where nothing is open."""
+    """The most informative label over all trials; None if no boundary is ambiguous."""
     questions = [s.question for s in segmentations if s.question is not None]
     return max(questions, key=lambda question: question.gain, default=None)
 
 
 def known(
-    file: str, rate: float, shown: Iterable[Subtask], edges: Iterable[float],
-    failed: Failure | None = None, recorded: Any = None,
-) -> Segmentation:  # fmt: skip
-    """The subtasks `shown` between `edges` [s] (one more) that are known: without uncertainty or evidence."""
+    file: str, rate: float, shown: Iterable[Subtask], edges: Iterable[float], recorded: Any = None
+) -> Segmentation:
+    """A segmentation known exactly: subtasks `shown` between `edges` [s] (one more), without uncertainty."""
     times = [float(edge) for edge in edges]
-    spans = tuple(
-        Span(s.name, s.object, s.state, a, b, 0.0, 0.0, (a, a), (b, b))
-        for s, a, b in zip(shown, times[:-1], times[1:], strict=True)
-    )
-    return Segmentation(file, rate, None, spans, failed, recorded=recorded)
+    spans = spans_between(list(shown), times, [0.0] * len(times), [(edge, edge) for edge in times])
+    return Segmentation(file, rate, None, spans, recorded=recorded)
 
 
 def spans_table(segmentation: Segmentation) -> Table:
@@ -202,7 +207,7 @@ def spans_table(segmentation: Segmentation) -> Table:
 
 
 def trials_table(segmentations: Sequence[Segmentation]) -> Table:
-    """One row a trial: whether it fits its task, or where it does not."""
+    """One row a trial: whether it fits its task, or where it fails."""
     rows = [(Path(s.file).name, f"{s.rate:.4g} Hz", str(len(s.spans)), str(s.failed or "yes"))
             for s in segmentations]  # fmt: skip
     heads = ("trial", "rate", "subtasks", "fits its task")

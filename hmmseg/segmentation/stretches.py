@@ -1,14 +1,14 @@
-"""Stretches at rest of a recording: loads and what they do to pads.
+"""Stretches at rest of a recording: loads, and the displacement of the pads under them.
 
-A rounded or a soft tip meets its block with a small patch that grows as it is pressed, so that the first
-tenth of a newton moves it further than the last (Hertz 1882; fingertips of flesh and of rubber alike:
-Pawluk and Howe 1999). Its give is a straight line behind a toe,
+A rounded or soft tip meets its block with a small patch that grows under pressure, so the first tenth of a
+newton moves it further than the last (Hertz 1882; fingertips of flesh and of rubber alike: Pawluk and Howe
+1999). Its give is a straight line after a toe,
 
     give(load) = compliance x load + depth (1 - exp(-load / soft)).
 
-What a straight line makes of such a contact ends it while it is still pressed: on a robot arm's stock pads
-by 25 ms. Within each stretch at rest a straight line of its own is taken out, so that what differs between
-contacts is no curvature; the depth is common to all.
+A straight line alone would end such a contact while it is still pressed: by 25 ms with a robot arm's stock
+pads. A separate straight line is removed from each stretch at rest, so that differences between contacts do
+not pass for curvature; the depth is common to all.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.levels import MOVED, SETTLING, SURE, TAIL, decisive
-from hmmseg.robust import median_of_known, robust_sd
-from hmmseg.segmentation.emissions import Parameters, noise_sd
+from hmmseg.robust import robust_sd
+from hmmseg.segmentation.emissions import Parameters, channel_sd
 
 
 def lagging(values: np.ndarray, kept: np.ndarray, place: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """What filters make of even steps of signals (..., num_steps), at times between two steps (..., N, C).
+    """Output of first-order filters fed with evenly spaced signals (..., num_steps), at N times (..., N, C).
 
-    `kept` (C,): the share of what was before that each filter keeps in a step; before the first step it was
-    as in that. `place` (N,), never falling: the step before each time, `share` (N,): how far it is on the way
-    to the next.
+    `kept` (C,): share of the past that each filter keeps in a step; the input is constant before the first
+    step. `place` (N,), non-decreasing: the step before each time; `share` (N,): its fraction of the way to
+    the next.
     """
     steps = np.empty((*values.shape, kept.size))
     steps[..., 0, :] = values[..., :1]
@@ -39,29 +39,29 @@ def lagging(values: np.ndarray, kept: np.ndarray, place: np.ndarray, share: np.n
     return (1 - share) * steps[..., place, :] + share * steps[..., place + 1, :]
 
 
-SOFTS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # numerics: N; loads at which the toe may end, a factor of two apart
-DEPENDENT = 0.5  # prior: share of the samples of a stretch that are evidence of their own
-DEPTH = 5e-4  # prior: m; sd of how deep a toe is
+SOFTS = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # numerics: N; scale of a toe's load, a factor of two apart
+DEPENDENT = 0.5  # prior: share of the samples of a stretch that are independent evidence
+DEPTH = 5e-4  # prior: m; sd of the depth of a toe
 ROUNDED = 0.5  # prior: share of contacts whose tips are rounded or soft enough for a toe
 ROUNDS = 6  # numerics: of reweighting
-LEVEL = 1e-28  # numerics: of the squares of loads that do not differ, what rounding leaves about their mean
-Reading = tuple[np.ndarray, np.ndarray, float]
+LEVEL = 1e-28  # numerics: relative variance that rounding leaves of equal loads
+Reading = tuple[np.ndarray, np.ndarray, float]  # loads [N], values [m] and their noise [m] of one stretch
 
 
 @dataclass(frozen=True)
 class Toe:
-    """What a contact gives beyond its straight line: `depth` [m], `soft` [N], of the load that is read."""
+    """Give of a contact beyond its straight line: `depth` [m], and scale `soft` [N] of the measured load."""
 
     depth: float = 0.0
     soft: float = 1.0
 
     def give(self, load: np.ndarray) -> np.ndarray:
-        """Give [m] at each load [N]; none of a load below 0."""
+        """Give [m] at each load [N]; none below 0."""
         return self.depth * -np.expm1(-np.maximum(load, 0.0) / self.soft)
 
     @property
     def slope(self) -> float:
-        """Compliance [m/N] that it adds to a contact that is hardly pressed."""
+        """Additional compliance [m/N] at zero load."""
         return self.depth / self.soft
 
 
@@ -69,7 +69,7 @@ NONE = Toe()
 
 
 def find(readings: Sequence[Reading]) -> Toe:
-    """The toe that loads [N], values [m] and their noise [m] of each stretch show together; NONE if none.
+    """The toe common to all stretches, or NONE.
 
     Loads are those of the contact itself, 0 where it ends.
     """
@@ -77,7 +77,7 @@ def find(readings: Sequence[Reading]) -> Toe:
     if not readings:
         return NONE
     usual = float(np.median([sd for *_, sd in readings]))
-    # Loads and values (num_stretches, N) of all stretches, and which are there; the rest is 0.
+    # Loads and values (num_stretches, N) of all stretches, zero-padded, and a mask of samples.
     sizes = np.array([load.size for load, *_ in readings])
     there = np.arange(sizes.max()) < sizes[:, None]
     load, value = np.zeros(there.shape), np.zeros(there.shape)
@@ -87,7 +87,7 @@ def find(readings: Sequence[Reading]) -> Toe:
     toes = np.stack([Toe(1.0, soft).give(load) for soft in SOFTS])
     depth, residual, precision = _depths(load, value, toes, there, scale)
     gain = _evidence(residual, there, scale) - _evidence(straight, there, scale) - (depth / DEPTH) ** 2 / 2
-    gain -= np.log(DEPTH**2 * precision) / 2  # the depth integrated out (Laplace)
+    gain -= np.log(DEPTH**2 * precision) / 2  # depth integrated out (Laplace)
     best = int(gain.argmax())
     sure = np.logaddexp.reduce(gain) - np.log(len(SOFTS)) > decisive(ROUNDED) and depth[best] > 0
     return Toe(float(depth[best]), SOFTS[best]) if sure else NONE
@@ -102,10 +102,10 @@ def _evidence(residual: np.ndarray, there: np.ndarray, scale: float) -> np.ndarr
 def _depths(
     load: np.ndarray, value: np.ndarray, toes: np.ndarray, there: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Common depth [m] (K,) of a toe of each shape (K, num_stretches, N), residuals of all samples, and the
-    precision [1/m^2] (K,) of the depth.
+    """Common depth [m] (K,) of toes of K shapes, residuals, and the precision [1/m^2] (K,) of the depth.
 
-    Each stretch has a line of its own. Student-t, reweighted.
+    `load`, `value` (num_stretches, N), each stretch with its own straight line; `toes` (K, num_stretches, N)
+    of unit depth; `there`: mask of samples. Student-t, reweighted.
     """
     weight = np.broadcast_to(there, toes.shape).astype(float)
     depth = residual = curved = np.zeros(0)
@@ -125,17 +125,16 @@ def _depths(
     return depth, residual, DEPENDENT * curved / scale**2 + (1 - DEPENDENT) / DEPTH**2
 
 
-# chosen: of a block's weight on the fingers: the rest is on the ground, whatever it accelerates
-SUPPORTED = 0.85
-FARTHEST = 0.5  # numerics: s; values further from a contact than any delay that is tried are not kept
+SUPPORTED = 0.85  # chosen: share of a block's weight on the fingers below which it surely rests
+FARTHEST = 0.5  # numerics: s; values further from a contact than any candidate delay are dropped
 
 
 @dataclass(frozen=True)
 class Stretch:
-    """Samples (N,) at rest: times t [s] and loads [N] in contact; value at any time.
+    """Samples (N,) in contact at rest, with times t [s] and loads [N], and values around them.
 
-    `interval` [s]: median time between samples. `place` (M,) is the value at `clock` (M,) [s], `sd` [m] its
-    noise. A contact with a `toe` is read as if straight.
+    `interval` [s]: median time between samples. `place` (M,): values at `clock` (M,) [s], `sd` [m] their
+    noise. A `toe` is removed when the contact is read.
     """
 
     t: np.ndarray
@@ -150,13 +149,13 @@ class Stretch:
 def stretches(
     s: Signals, start: float, end: float, weight: float, p: Parameters
 ) -> tuple[Stretch | None, Stretch | None]:
-    """One hold on the ground, as the fingers' distance and as their height, where both fingers press.
+    """One hold on the ground as stretches of the fingers' distance and height, while both fingers press.
 
-    Its alignment says `start` and `end` [s] but for a sample or two. The block of this `weight` [N]
-    rests for sure where its support carries some of it.
+    `start` and `end` [s] are those of its alignment, to a sample or two. A block of this `weight` [N] surely
+    rests while its support carries part of it.
     """
     inside = (s.t >= start) & (s.t <= end)
-    sd_force = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
+    sd_force = p.force_sd(s)
     fx1, fx2 = s.fx1 - p.bias[0], s.fx2 - p.bias[2]
     fy = s.fy1 + s.fy2 - p.bias[1] - p.bias[3]
     noise = np.sqrt(2.0) * sd_force
@@ -173,18 +172,16 @@ def stretches(
             out.append(None)
             continue
         interval = float(np.median(np.diff(s.t, prepend=2 * s.t[0] - s.t[1])[use]))
-        sd, t = median_of_known(stated), s.t[use]
-        sd = noise_sd(value) if np.isnan(sd) else sd
+        sd, t = channel_sd(stated, value), s.t[use]
         there &= (s.t >= t[0] - FARTHEST) & (s.t <= t[-1] + FARTHEST)
         out.append(Stretch(t, load[use], interval, s.t[there], value[there], max(sd, 1e-9)))
     return out[0], out[1]
 
 
 def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]:
-    """The steepest ratio of shear to grip force that each finger shows for sure between two times [s]."""
+    """Largest ratio of shear to grip force that each finger surely reaches between two times [s]."""
     inside = (s.t >= start) & (s.t <= end)
-    sd = p.scale["force"] if np.isnan(s.sd_force) else s.sd_force
-    out = []
+    sd, out = p.force_sd(s), []
     for grip, shear in ((s.fx1 - p.bias[0], s.fy1 - p.bias[1]), (-(s.fx2 - p.bias[2]), s.fy2 - p.bias[3])):
         use = inside & (grip > SURE * sd) & np.isfinite(shear)
         if use.any():
@@ -193,11 +190,11 @@ def steepest(s: Signals, start: float, end: float, p: Parameters) -> list[float]
 
 
 def ringing(s: Signals, start: float, end: float, p: Parameters) -> list[tuple[float, float, float]]:
-    """What loads still show [N] once the fingers have left a hold, or nothing: they ring, or come late.
+    """Residual loads [N] after the fingers have left a hold, if any: ringing, or late forces.
 
-    Looked at is what follows its end, while it settles and the fingers are farther apart than they were by
-    more than any pad gives, where there is no contact. The largest along the grip and in shear, and how far
-    those along the grip swing to either side, as what is late does not.
+    Looks at the samples after its end, while it settles and the fingers are farther apart than any pad gives,
+    so that there is no contact. Returns the largest load along the grip and in shear, and the swing along the
+    grip to either side, which a mere delay does not produce.
     """
     held = (s.t >= start) & (s.t <= end) & np.isfinite(s.distance)
     if not held.any():
@@ -215,18 +212,18 @@ def ringing(s: Signals, start: float, end: float, p: Parameters) -> list[tuple[f
 
 
 def reading(s: Stretch, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Loads and values (M,) that belong together for forces `shift` s late.
+    """Corresponding loads and values (M,) for forces that are `shift` s late.
 
     Loads are interpolated to the times of the values, whose noise matters more; up to the shift beyond the
-    first and the last of them, which say most, they are extrapolated. A contact with a toe is read as if it
-    were straight.
+    first and the last, which are the most informative, they are extrapolated. A toe is removed from the
+    values.
     """
     t, late = s.t, s.clock + shift
     if t.size < 2:
         return np.zeros(0), np.zeros(0)
     after = np.clip(np.searchsorted(t, late), 1, t.size - 1)
     step, edge = np.diff(t)[after - 1], abs(shift) + 1e-9
-    # A straight line between two loads, and beyond the first and the last.
+    # Linear between two loads, and beyond the first and the last.
     load = s.load[after - 1] + (s.load[after] - s.load[after - 1]) * ((late - t[after - 1]) / step)
     within = (late >= t[0] - edge) & (late <= t[-1] + edge) & (step < 1.5 * s.interval)
     return load[within], s.place[within] + s.toe.give(load[within])
@@ -235,8 +232,8 @@ def reading(s: Stretch, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 def fitted(load: np.ndarray, value: np.ndarray, sd: float) -> tuple[float, float]:
     """Slope -dvalue/dload of samples (N,) and its information; Student-t, reweighted.
 
-    Noise of the loads, taken as what the line leaves of values, would flatten the slope by its share of their
-    variance: that much is not known. Both are 0 of fewer than four samples, or where no load differs.
+    Noise of the loads, bounded by the residual of the values, would flatten the slope by its share of their
+    variance, which counts as uncertainty. Both are 0 for fewer than four samples, or equal loads.
     """
     weight, slope, information = np.ones(load.size), 0.0, 0.0
     for _ in range(ROUNDS - 1 if load.size > 3 else 0):

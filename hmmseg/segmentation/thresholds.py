@@ -1,11 +1,10 @@
-"""The qualitative segmentation: thresholds, contact states by rules, subtasks by their order.
+"""Qualitative segmentation: thresholds, rules for contact states, and the order of the subtasks.
 
-The rival of the switching model, after Dupont, Schulteis, Millman and Howe (1999), Section 3.3
-and Table 2. Signals become tri-valued by symmetric thresholds; rules on those values name the
-contact state of every sample (0 where no rule holds); the known order of the subtasks turns
-states into spans: of all assignments in that order, the one that agrees with most samples. Where several do,
-the one that holds on the ground longer: net upward force under a weight that still rests shows as
-hold-above-ground, which the rules cannot tell apart.
+The rival of the switching model, after Dupont, Schulteis, Millman and Howe (1999), Section 3.3 and Table 2.
+Signals become tri-valued by symmetric thresholds; rules on these values give the contact state of every
+sample (0 where no rule holds). Among all assignments of samples to subtasks in the task's order, the one that
+agrees with most samples gives the spans. Ties go to the longer hold on ground: under a weight that still
+rests, a net upward force looks like hold above ground, which the rules cannot distinguish.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from hmmseg.errors import InputError
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import AnyTask, BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.segmentation.spans import Failure, Segmentation, Span
+from hmmseg.segmentation.spans import Failure, Segmentation, Span, spans_between
 
 FORCE_THRESHOLD = 0.05  # cited: N
 VELOCITY_THRESHOLD = 0.05  # cited: m/s
 NUMBERS = {FREE: 1, ABOVE_GROUND: 2, ON_GROUND: 3, SLIDING: 3}  # cited: the paper's; 0 is none of them
-JUMP = 0.05  # chosen: share of all samples by which going on behind a missing subtask must agree better
+JUMP = 0.05  # chosen: share of all samples by which skipping a missing subtask must improve agreement
 
 
 @dataclass(frozen=True)
 class StateLabels:
     """Contact state of every sample, in the paper's numbering.
 
-    `state` (num_timesteps,) int: 0 none, 1 free motion, 2 hold above ground, 3 hold on ground;
-    `sliding` (num_timesteps,) bool marks the samples of 3 that slide.
+    `state` (num_timesteps,) int: 0 none, 1 free motion, 2 hold above ground, 3 hold on ground; `sliding`
+    (num_timesteps,) bool marks the samples of 3 that slide.
     """
 
     state: np.ndarray
@@ -43,9 +42,9 @@ class StateLabels:
 
 @dataclass(frozen=True)
 class Assignment:
-    """Samples of every subtask: first and last (num_subtasks,), -1 where it has none.
+    """First and last sample of every subtask (num_subtasks,), -1 if it has none.
 
-    `agreement` is the share of samples whose state is that of the subtask they lie in.
+    `agreement`: share of samples whose state is that of their subtask.
     """
 
     first: np.ndarray
@@ -62,22 +61,21 @@ Order = Callable[[StateLabels, tuple[Subtask, ...]], Assignment]
 
 
 def threshold(values: np.ndarray, level: float) -> np.ndarray:
-    """Tri-valued function of a signal: +1, 0 or -1 against +-level; NaN where it is missing."""
+    """Tri-valued signal: +1, 0 or -1 against +-level; NaN where missing."""
     sign = np.where(values > level, 1.0, np.where(values < -level, -1.0, 0.0))
     return np.where(np.isnan(values), np.nan, sign)
 
 
 def label_states(
-    signals: Signals,
-    force_threshold: float = FORCE_THRESHOLD,
-    velocity_threshold: float = VELOCITY_THRESHOLD,
+    signals: Signals, force_threshold: float = FORCE_THRESHOLD, velocity_threshold: float = VELOCITY_THRESHOLD
 ) -> StateLabels:
     """Contact state of every sample by the rules of the paper's Table 2.
 
-    Thresholds in N and m/s. Free motion: both force components of both fingers are 0. Hold on
-    ground: grip +, net vertical force - or 0, mean vertical velocity 0; sliding where moreover
-    the mean horizontal velocity is not 0. Hold above ground: grip + and net vertical force +. A
-    sample that lacks a signal its rule asks for is 0. InputError for a threshold that is not > 0.
+    Free motion: both force components of both fingers are 0. Hold on ground: grip +, net vertical force - or
+    0, mean vertical velocity 0; sliding if in addition the mean horizontal velocity is not 0. Hold above
+    ground: grip + and net vertical force +. A sample without a signal that its rule needs is 0.
+
+    Thresholds in N and m/s; InputError unless they are > 0.
     """
     for name, value in (("--force-threshold", force_threshold), ("--velocity-threshold", velocity_threshold)):
         if not (math.isfinite(value) and value > 0):
@@ -106,15 +104,15 @@ def agreement(labels: StateLabels, steps: tuple[Subtask, ...]) -> np.ndarray:
 
 
 def monotone_order(labels: StateLabels, steps: tuple[Subtask, ...]) -> Assignment:
-    """The assignment in order that agrees with most samples, by dynamic programming.
+    """The ordered assignment that agrees with most samples, by dynamic programming.
 
-    Every subtask gets a sample that agrees with it if that is possible at all. Otherwise the order
-    ends early or passes over subtasks, the latter only if 5 % of all samples agree more for it:
-    flicker between states must not pass for the subtasks of a later move.
+    If possible, every subtask gets a sample that agrees with it. Otherwise the order ends early or skips
+    subtasks, the latter only if JUMP of all samples agree more for it: flicker between states must not pass
+    for the subtasks of a later move.
     """
     agrees = agreement(labels, steps)
     on_ground = np.array([step.state == ON_GROUND for step in steps])
-    # Agreement decides; the 1 breaks ties in favour of holding on the ground.
+    # Agreement decides; the 1 breaks ties in favour of hold on ground.
     score = agrees * (labels.state.size + 1) + ((labels.state == 2)[:, None] & on_ground)
     entries = _best_entries(agrees, score, may_skip=False) or _best_entries(agrees, score, may_skip=True)
     length, count = agrees.shape
@@ -126,12 +124,11 @@ def monotone_order(labels: StateLabels, steps: tuple[Subtask, ...]) -> Assignmen
 
 
 def _best_entries(agrees: np.ndarray, score: np.ndarray, may_skip: bool) -> list[tuple[int, int]]:
-    """Subtasks and their first samples on the best path, in order; none if there is no path.
+    """Subtasks and their first samples on the best path, in order; empty if there is no path.
 
-    A subtask may only be entered at a sample that agrees with it, which loses nothing: leading
-    samples that disagree serve the subtask before as well. best[s + 1][t] is the score of the best
-    path with the samples before t assigned and subtask s the last; the samples before the first
-    subtask's entry, best[0], score nothing.
+    A subtask may only be entered at a sample that agrees with it, without loss, as leading samples that
+    disagree serve the previous subtask just as well. best[s + 1][t] is the score of the best path that
+    assigns the samples before t and is in subtask s; samples before the first entry, best[0], score nothing.
     """
     length, count = agrees.shape
     total = np.vstack([np.zeros(count), np.cumsum(score, axis=0)])  # (length + 1, count)
@@ -161,19 +158,19 @@ def segment_qualitative(
     velocity_threshold: float = VELOCITY_THRESHOLD,
     order: Order = monotone_order,
 ) -> Segmentation:
-    """Segmentation of one trial by thresholds, rules and the order of the subtasks.
+    """Segment one trial by thresholds, rules and the order of the subtasks.
 
-    A boundary lies anywhere between the last sample of one subtask and the first of the next:
-    its median is the midpoint, its deviation and interval those of a uniform. There is no
-    evidence. A subtask without samples fails the trial; the others keep their spans.
+    A boundary lies anywhere between the last sample of one subtask and the first of the next: its median is
+    the midpoint, its deviation and interval those of a uniform distribution. There is no evidence. A subtask
+    without samples fails the trial; the others keep their spans.
 
     Args:
         trial: the recording.
         signals: its signals in task space.
-        task: a task of blocks; one with `repeat = "unknown"` is repeated as often as agrees best.
-        force_threshold: below which a force counts as none [N].
-        velocity_threshold: below which a velocity counts as none [m/s].
-        order: how the states of samples become subtasks in order.
+        task: a task of blocks; with `repeat = "unknown"` it is repeated as often as agrees best.
+        force_threshold: forces below it count as none [N].
+        velocity_threshold: velocities below it count as none [m/s].
+        order: assigns the states of samples to the ordered subtasks.
 
     Returns:
         The trial's segmentation.
@@ -198,7 +195,7 @@ def segment_qualitative(
 
 
 def _repeated(task: BlockTask, labels: StateLabels, order: Order) -> tuple[tuple[Subtask, ...], Assignment]:
-    """Subtasks and assignment; an unknown number of repeats grows as long as it agrees better."""
+    """Subtasks and assignment; an unknown number of repeats grows while agreement improves."""
     if task.repeat != "unknown":
         steps = subtasks(task)
         return steps, order(labels, steps)
@@ -217,8 +214,6 @@ def _spans(t: np.ndarray, steps: tuple[Subtask, ...], assigned: Assignment) -> t
     begin = [t[0], *t[assigned.last[shown[:-1]]], t[-1]]  # the interval each boundary lies in
     end = [t[0], *t[assigned.first[shown[1:]]], t[-1]]
     middle, width = np.add(begin, end) / 2, np.subtract(end, begin)
-    interval = [(m - 0.45 * w, m + 0.45 * w) for m, w in zip(middle.tolist(), width.tolist(), strict=True)]
-    every = middle.tolist(), (width / math.sqrt(12)).tolist(), interval
-    ends = [each for pair in every for each in (pair[:-1], pair[1:])]
-    own = [steps[s] for s in shown]
-    return tuple(Span(s.name, s.object, s.state, *rest) for s, *rest in zip(own, *ends, strict=True))
+    intervals = [(m - 0.45 * w, m + 0.45 * w) for m, w in zip(middle.tolist(), width.tolist(), strict=True)]
+    sds = (width / math.sqrt(12)).tolist()
+    return spans_between([steps[s] for s in shown], middle.tolist(), sds, intervals)

@@ -417,7 +417,8 @@ class Search:
         effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
         tried, wrong, found = 0, 0.0, best
         for k in np.argsort(-promised):
-            if tried >= TRIED or promised[k] < least:
+            # Two replacements are fitted whatever straight lines promise: these may miss them by more.
+            if tried >= TRIED or (promised[k] < least and (at is best or tried >= LEARNED)):
                 break
             begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
             names = self._take_apart(near[k], begin)
