@@ -295,7 +295,7 @@ def nuisances(
 
 ZERO_SHARE = 0.05  # limit: share of the largest force; a zero that drifts less matters less than other errors
 
-# Slopes that show the pads, by their names in `Weights.slopes`: their channel, and the readings they weigh.
+# Slopes that show the pads, by name in `WeighedTrial.slopes`: their channel, and the readings they weigh.
 SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
 
 
@@ -303,9 +303,9 @@ def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[i
     """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
     values, out = {k: np.nan_to_num(v) for k, v in channel_values(signals, rig).items()}, []
     for move in moves:
-        counts = weighed.weights.counts[move]
+        counts = weighed.counts[move]
         means = {k: np.where(counts[k] > 0, w @ values[k], np.nan)
-                 for k, w in weighed.weights.grips[move].items()}  # fmt: skip
+                 for k, w in weighed.grips[move].items()}  # fmt: skip
         out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
     return np.moveaxis(np.array(out), 2, 0)
 
@@ -315,7 +315,7 @@ def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Seq
     values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
         for k, (name, (_, reading)) in enumerate(SLOPES.items()):
-            slope = weighed.weights.slopes.get(move, {}).get(name)
+            slope = weighed.slopes.get(move, {}).get(name)
             if slope is not None:
                 out[i, k] = slope.weights @ np.nan_to_num(values[reading])
     return out
@@ -323,7 +323,7 @@ def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Seq
 
 def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Variances (num_moves, len(SLOPES)) of slopes, infinite where absent, and their common errors."""
-    slopes = [[weighed.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
+    slopes = [[weighed.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
     variance = [[np.inf if s is None else s.variance for s in row] for row in slopes]
     return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in slopes])
 
@@ -336,7 +336,7 @@ def pad_doubts(
     `variance`, `alike`: as in `slope_variances`, of all trials.
     """
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
-    for s, grip in ((a.signals, grip) for a in weighed for grip in a.weights.grips.values()):
+    for s, grip in ((a.signals, grip) for a in weighed for grip in a.grips.values()):
         along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
         usual.append((np.mean(grip["distance"] @ along), abs(np.mean(grip["place"] @ up))))
     admitted, out = float(np.hypot(*rig.systematic.pad_stiffness)) / 2, {}
@@ -360,7 +360,7 @@ def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int])
     out = []
     with np.errstate(divide="ignore", invalid="ignore"):  # channels without readings
         for move in moves:
-            part = {k: noise.variance[k] / n for k, n in weighed.weights.counts[move].items()}
+            part = {k: noise.variance[k] / n for k, n in weighed.counts[move].items()}
             out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
     return np.moveaxis(np.array(out), 2, 0)
 
@@ -377,7 +377,7 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     for a in weighed:
         squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
         gives.append([(np.mean(w["distance"] @ squeeze), *(np.mean(w[k] @ shear) for k in
-                      ("pickup", "force", "place"))) for w in a.weights.grips.values()])  # fmt: skip
+                      ("pickup", "force", "place"))) for w in a.grips.values()])  # fmt: skip
     grip, picked, carried, placed = np.moveaxis(np.array(gives), -1, 0)
     hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
     least = np.maximum(hanging, np.abs(placed - carried))
@@ -394,7 +394,7 @@ def free_means(
     the rig's own bias allow, is known in a grip no better than these stretches agree.
     """
     mean = np.stack([free_forces(a.signals, a) for a in weighed])
-    count = np.array([max(a.weights.free_count, 1.0) for a in weighed])
+    count = np.array([max(a.free_count, 1.0) for a in weighed])
     of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
     variance = of_sample[None, :] / count[:, None]
     moved = np.stack([_moved_zero(a, free_steps, of_sample, rig) for a in weighed])
@@ -404,7 +404,7 @@ def free_means(
 def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray, rig: Rig) -> np.ndarray:
     """Largest deviation (4,) [N] of a free stretch's forces from the mean of all; 0 if due to noise."""
     out = np.zeros(len(FORCE_CHANNELS))
-    spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.weights.free > 0) for k in free_steps]
+    spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0) for k in free_steps]
     for i, name in enumerate(FORCE_CHANNELS):
         force = getattr(a.signals, name)
         pieces = [force[span & np.isfinite(force)] for span in spans]
@@ -500,7 +500,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     raw = np.stack([observe(a.signals, a, rig, moves) for a in weighed])  # T, S, M, 3
     variance = np.stack([sampling_variance(a, noise, moves) for a in weighed])
     factor = np.stack(
-        [[a.weights.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in weighed]
+        [[a.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in weighed]
     )
     valid = np.isfinite(raw) & np.isfinite(variance)
     there = valid.mean(axis=1) > 0.5  # of the alignments

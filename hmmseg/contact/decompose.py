@@ -11,6 +11,7 @@ in all moves together, such as the heights in a tower of three.
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -224,6 +225,12 @@ class Evidence:
         wanted = (s.signal for s in self.sources if subtask in (None, s.subtask))
         return tuple(sorted(set(wanted)))
 
+    def terms(self) -> dict[str, Any]:
+        """What is learned and required, for JSON."""
+        return {"kind": "bound" if self.bound else "value",
+                "given": [f"{owner}.{name}" for name, owner in self.given],
+                "condition": self.condition}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Property:
@@ -245,6 +252,11 @@ class Property:
             return None
         return "bound" if all(evidence.bound for evidence in self.evidence) else "value"
 
+    def to_json(self) -> dict[str, Any] | None:
+        """Its entry in `decompose`'s JSON document."""
+        ways = [{"subtasks": e.subtasks, "signals": e.signals(), **e.terms()} for e in self.evidence]
+        return {"kind": self.kind, "evidence": ways} if ways else None
+
 
 @dataclass(frozen=True, repr=False)
 class Decomposition(Tabled):
@@ -255,10 +267,15 @@ class Decomposition(Tabled):
     properties: dict[str, dict[str, Property]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
+    @property
+    def entries(self) -> list[Property]:
+        """All properties of all objects."""
+        return [entry for entries in self.properties.values() for entry in entries.values()]
+
     def reveals(self, index: int) -> list[tuple[Property, Evidence]]:
         """Properties that subtask `index` helps to reveal, each with its first such evidence."""
         pairs = []
-        for entry in (entry for entries in self.properties.values() for entry in entries.values()):
+        for entry in self.entries:
             evidence = next((e for e in entry.evidence if index in e.subtasks), None)
             if evidence is not None:
                 pairs.append((entry, evidence))
@@ -286,17 +303,98 @@ class Decomposition(Tabled):
         first = {0} if moves else set()  # delimits whichever move is the first to stay
         return tuple(s for s in self.subtasks if s.index in useful | delimiting | first)
 
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why a property cannot be revealed, by `object.property`."""
+        return {f"{p.object}.{p.name}": p.reason for p in self.entries if p.reason is not None}
+
+    def cell(self, index: int, entry: Property, evidence: Evidence) -> str:
+        """Signals of subtask `index` that reveal a property; parentheses mark what goes beyond the paper."""
+        partners = [str(other + 1) for other in evidence.subtasks if other != index]
+        signals = " and ".join(evidence.signals(index)).replace("horizontal forces and", "horizontal and")
+        text = (">= " if evidence.bound else "") + signals
+        if entry.object != self.subtasks[index].object:
+            text = f"{entry.object}: {text}"
+        if partners:
+            text += f", with {', '.join(partners)}"
+        if evidence.condition:
+            text += f"; {evidence.condition}"
+        return text if self.in_paper(index, entry) else f"({text})"
+
+    def equation(self) -> str:
+        """The decomposition in the notation of the paper's equation 1: subtask = (state, {properties})."""
+        numbered = {name: re.fullmatch(r"(.*?)(\d+)", name) for name in self.properties}
+        label = {name: name for name in numbered}
+        if len({match[1] for match in numbered.values() if match}) == 1 and all(numbered.values()):
+            label = {name: match[2] for name, match in numbered.items() if match}  # block1: 1
+        parts = []
+        for s in self.subtasks:
+            revealed = [entry for entry, _ in self.reveals(s.index) if self.in_paper(s.index, entry)]
+            names = [f"{entry.name.replace('_', ' ')} {label[entry.object]}" for entry in revealed]
+            subject = s.name if s.object is None else f"{s.name.capitalize()} {label[s.object]}"
+            state = s.state if s.object is None or s.state == FREE else f"{s.state} {label[s.object]}"
+            parts.append(f"{subject} = ({state}, {{{', '.join(names) or '∅'}}})")
+        return "T = { " + ",\n      ".join(parts) + " }"
+
     def to_json(self) -> dict[str, Any]:
         """The body of `decompose`'s JSON document."""
-        from hmmseg.contact.tables import decomposition_document
-
-        return decomposition_document(self)
+        document: dict[str, Any] = {
+            "subtasks": [
+                {
+                    "index": subtask.index,
+                    "subtask": subtask.name,
+                    "object": subtask.object,
+                    "state": subtask.state,
+                    "move": None if subtask.move is None else subtask.move + 1,
+                    "support": subtask.support,
+                    "constraints": subtask.constraints,
+                    "properties": [
+                        {"property": f"{entry.object}.{entry.name}",
+                         "signals": evidence.signals(subtask.index),
+                         "with": [other for other in evidence.subtasks if other != subtask.index],
+                         **evidence.terms(),
+                         "in_paper": self.in_paper(subtask.index, entry)}
+                        for entry, evidence in self.reveals(subtask.index)
+                    ],
+                }
+                for subtask in self.subtasks
+            ],
+            "minimal": [subtask.index for subtask in self.minimal()],
+            "equation": self.equation(),
+            "properties": {
+                name: {key: entry.to_json() for key, entry in entries.items()}
+                for name, entries in self.properties.items()
+            },
+            "reasons": self.reasons,
+            "notes": self.notes,
+        }  # fmt: skip
+        if isinstance(self.task, BlockTask):
+            rises = height_equations(self.task)
+            document["height_equations"] = [{"move": index + 1, "rise": rise} for index, rise in rises]
+            document["repeat"] = self.task.repeat
+        return document
 
     def tables(self) -> list[Any]:
-        """The subtasks and what each reveals."""
-        from hmmseg.contact.tables import decomposition_table
+        """The paper's Table 1; in parentheses, what the balance gives beyond it."""
+        from rich.table import Table
 
-        return [decomposition_table(self)]
+        columns = [WEIGHT, WIDTH, HEIGHT, FRICTION] if self.properties else []
+        if any(entry.name.startswith(FRICTION_ON) for entry in self.entries):
+            columns.append(FRICTION_ON)
+        heads = {FRICTION: "Friction of fingers", FRICTION_ON: "Friction on support"}
+        caption = "Parentheses: derivable, though not in the paper's table. >=: a lower bound."
+        table = Table(caption=caption if columns else None, show_lines=bool(columns))
+        for head in ("", "Subtask", "State"):
+            table.add_column(head, no_wrap=True)
+        for column in columns:
+            table.add_column(heads.get(column, column.capitalize()))
+        for subtask in self.subtasks:
+            cells = {column: "" for column in columns}
+            for entry, evidence in self.reveals(subtask.index):
+                column = FRICTION_ON if entry.name.startswith(FRICTION_ON) else entry.name
+                cells[column] = self.cell(subtask.index, entry, evidence)
+            table.add_row(str(subtask.index + 1), subtask.label, subtask.state, *cells.values())
+        return [table]
 
 
 VARYING_LOAD = "the vertical force must vary while the object slides"
