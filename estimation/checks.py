@@ -19,7 +19,7 @@ from estimation.observations import CHANNELS
 from estimation.pads import unit_pads
 from estimation.posterior import NUM_CHANNELS, Posterior
 from estimation.sampler import Draws
-from hmmseg.hand.plausibility import Finding, all_changed
+from hmmseg.hand.plausibility import Finding, changed
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.units import UNITS
@@ -150,7 +150,7 @@ def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> 
         density = weight / (rig.gravity * area**1.5)
         unit = min(("mN", "gf"), key=lambda name: abs(np.log(density * UNITS[name][1] / LIGHT)))
         names = rig.gripper.wrench[:3] if rig.gripper is not None else FORCE_CHANNELS
-        remedy = Finding(names[0], "", all_changed(names, rig, unit=unit)).remedy
+        remedy = Finding(names[0], "", changed(names, rig, unit=unit)).remedy
         return [
             f"{obj} weighs {weight:.3g} N at {width * 1e3:.3g} x {area / width * 1e3:.3g} mm: of steel it "
             f"would be {depth:.2g} m deep, so forces look like {unit}; expected {remedy}"

@@ -1,4 +1,4 @@
-"""Are the uncertainties true? Boundaries and properties against the truth of many cases.
+"""Calibration of the uncertainties: boundaries and properties against the truth of many cases.
 
     python -m experiments.calibration [RECORDINGS] [--cases 64]
 
@@ -25,7 +25,7 @@ from estimation.sampler import sample
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
 from experiments.scoring import boundaries_covered, boundary_residuals
-from experiments.table_text import covered, load, markdown, milliseconds, percent
+from experiments.table_text import covered, markdown, milliseconds, percent
 from experiments.worlds import HAND, SEED, simulated_cases
 from hmmseg.segmentation.align import align
 
@@ -154,11 +154,8 @@ def calibrate(cases: Sequence[Case], pooled: int = POOLED, singles: int | None =
     }  # fmt: skip
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/tables/calibration.csv: coverages by kind of boundary and property, by sampling and by Laplace."""
-    found = load("calibration")
-    if found is None:
-        return None
     parts = []
     for name, title in SETS.items():
         if name not in found:
@@ -181,10 +178,9 @@ def table() -> str | None:
     return "\n\n".join(parts)
 
 
-def headline() -> str | None:
+def headline(found: dict) -> str | None:
     """README: errors and coverage on two kinds of recordings, in four rows."""
-    found = load("calibration")
-    if found is None or "recordings" not in found:
+    if "recordings" not in found:
         return None
     columns = [found["recordings"]["pooled"], found["bank"]["pooled"]]
     b, p = [c["boundaries"]["all"] for c in columns], [c["properties"] for c in columns]
@@ -199,10 +195,9 @@ def headline() -> str | None:
     return f"{table}\n\nFour trials a case; properties: rms relative error."
 
 
-def results() -> str | None:
-    """docs/results.md: what was measured on two kinds of recordings; the paper's numbers below."""
-    found = load("calibration")
-    if found is None or "recordings" not in found:
+def results(found: dict, speed: dict) -> str | None:
+    """docs/results.md: errors and coverage on two kinds of recordings, with the paper's errors below."""
+    if "recordings" not in found:
         return None
     columns = [found["recordings"]["pooled"], found["bank"]["pooled"]]
     b, p = [c["boundaries"]["all"] for c in columns], [c["properties"] for c in columns]
@@ -223,10 +218,8 @@ def results() -> str | None:
     note = (
         f"Coverages with their standard error over cases. The paper's own errors, of one recording: {theirs}."
     )
-    speed = load("benchmark_commands")
-    if speed is not None:
-        seconds = speed["commands"]["identify"]["warm"]
-        note += f" `hmmseg identify` of one trial takes {seconds:.1f} s of processor."
+    seconds = speed["commands"]["identify"]["warm"]
+    note += f" `hmmseg identify` of one trial takes {seconds:.1f} s of processor."
     note += f" Code of {found['made_by']}."
     head = ["", "stand-in recordings", "virtual model, fresh seeds"]
     return f"{markdown(head, rows)}\n\n{note}"

@@ -1,4 +1,4 @@
-"""Do intervals hold wherever the tool is used? Properties and boundaries in worlds that differ, a row each.
+"""Coverage of intervals for properties and boundaries in different worlds, a row each.
 
     python -m experiments.calibration_worlds [--rows NAME...] [--replicates 16] [--fresh]
 
@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from experiments.saving import save
+from experiments.saving import panels, save
 from experiments.scoring import PROPERTIES, boundaries_covered, boundary_residuals
-from experiments.table_text import load, markdown, milliseconds, percent
+from experiments.table_text import markdown, milliseconds, percent
 from experiments.worlds import WORLDS, Replicate, replicates
 from hmmseg.segmentation.spans import Segmentation
 
@@ -45,23 +45,18 @@ def score(found: Replicate, seed: int = 0) -> dict[str, Any]:
 
     began = time.process_time()
     said = identify(found.trials, found.task, found.rig, seed)
-    properties = []
-    for obj, block in found.blocks.items():
-        for prop in ("weight", "width", "height"):
-            if (obj, prop) not in said.names:
-                continue
-            draws, true = said.of(obj, prop), getattr(block, prop)
-            properties.append({
-                "of": f"{obj}.{prop}", "share": float(draws.mean() / true - 1),
-                "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
-            })  # fmt: skip
+    known = [
+        (f"{obj}.{prop}", said.of(obj, prop), getattr(block, prop))
+        for obj, block in found.blocks.items() for prop in PROPERTIES if (obj, prop) in said.names
+    ]  # fmt: skip
     for i, unknown in enumerate(said.combinations):
         true = sum(c * found.blocks[obj].height for obj, c in unknown.terms.items())
-        draws = said.combined[:, i]
-        properties.append({
-            "of": ".".join(unknown.name), "share": float(draws.mean() / true - 1),
-            "z": float((draws.mean() - true) / draws.std()), "rank": float((draws < true).mean()),
-        })  # fmt: skip
+        known.append((".".join(unknown.name), said.combined[:, i], true))
+    properties = [
+        {"of": name, "share": float(draws.mean() / true - 1), "z": float((draws.mean() - true) / draws.std()),
+         "rank": float((draws < true).mean())}
+        for name, draws, true in known
+    ]  # fmt: skip
     pairs = [(s, b) for s, b in zip(said.segmentations, found.boundaries, strict=True) if s.complete]
     residual = [r for s, b in pairs for r in boundary_residuals(s, b)]
     held = [r for s, b in pairs for r in boundaries_covered(s, b)]
@@ -75,7 +70,7 @@ def score(found: Replicate, seed: int = 0) -> dict[str, Any]:
 
 
 def _reaches(found: Segmentation, truth: np.ndarray) -> list[float]:
-    """How far each true boundary lies from that found, as a share of the way to that end of its interval."""
+    """Distance of each true boundary from the one found, over that to the same end of its interval."""
     ends = [(s.start, *s.start_90) for s in found.spans[1:]]
     return [
         float((t - at) / max(high - at, 1e-9) if t > at else (at - t) / max(at - low, 1e-9))
@@ -96,7 +91,7 @@ def summary(scored: Sequence[dict[str, Any]]) -> dict[str, Any]:
     for level in LEVELS:
         inside = [np.abs(r - 0.5) < level / 2 for r in ranks]
         out[f"coverage_{100 * level:.0f}"], out[f"se_{100 * level:.0f}"] = clustered(inside)
-    for prop in ("weight", "width", "height"):
+    for prop in PROPERTIES:
         mine = [p for s in scored for p in s["properties"] if p["of"].endswith(prop)]
         if mine:
             out[prop] = {
@@ -104,7 +99,7 @@ def summary(scored: Sequence[dict[str, Any]]) -> dict[str, Any]:
                 "z_rms": float(np.sqrt(np.mean([p["z"] ** 2 for p in mine]))),
                 "coverage_95": float(np.mean([abs(p["rank"] - 0.5) < 0.475 for p in mine])),
             }
-    # By what factor intervals would have to be wider to hold just as often as they say.
+    # Factor by which intervals would have to widen to reach their nominal coverage.
     out["needed_95"] = float(np.quantile(np.abs(z), 0.95) / ndtri(0.975)) if z.size else None
     reach = np.concatenate([s["reach_90"] for s in scored])
     out["needed_90"] = float(np.quantile(reach, 0.9)) if reach.size else None
@@ -123,39 +118,31 @@ def clustered(inside: Sequence[np.ndarray]) -> tuple[float | None, float | None]
     share = float(every.mean())
     scores = np.array([(r - share).sum() for r in rows]) / np.mean([r.size for r in rows])
     spread = float(np.std(scores, ddof=1) / np.sqrt(len(rows))) if len(rows) > 1 else 0.0
-    # Agresti and Coull's: where all are inside, a standard error of nought says too much.
+    # Agresti and Coull's: if all are inside, a standard error of zero would be too confident.
     share_at_least = (every.sum() + 2) / (every.size + 4)
     return share, max(spread, float(np.sqrt(share_at_least * (1 - share_at_least) / (every.size + 4))))
 
 
 def draw(rows: dict[str, dict[str, Any]], path: Path) -> None:
-    """A panel for each level, a line for each world; grey is what is to be reached."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(10, 0.26 * len(rows) + 1.2), sharey=True, layout="constrained")
-    names = list(rows)
-    for ax, (key, title, (low, high)) in zip(axes, PANELS, strict=True):
-        ax.axvspan(low, high, color="0.88", lw=0)
-        for y, name in enumerate(names):
-            share, error = rows[name][f"coverage_{key}"], rows[name][f"se_{key}"]
-            if share is None:
-                continue
-            inside = low - 200 * error <= 100 * share <= high + 200 * error
-            ax.errorbar(100 * share, y, xerr=100 * error, fmt="o", ms=3.5, lw=1,
-                        color="C0" if inside else "C3")  # fmt: skip
-        ax.set_title(title, fontsize=9)
-        ax.set_xlim(30 if key == "68" else 55, 101)
-        ax.tick_params(labelsize=8)
-        ax.set_xlabel("true values inside [%]", fontsize=8)
-        ax.grid(axis="x", lw=0.3)
-    axes[0].set_yticks(range(len(names)), names)
-    axes[0].invert_yaxis()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    """Draw a panel for each level and a line for each world; the goal is grey."""
+    with panels(path, 1, 3, figsize=(10, 0.26 * len(rows) + 1.2), sharey=True) as axes:
+        names = list(rows)
+        for ax, (key, title, (low, high)) in zip(axes, PANELS, strict=True):
+            ax.axvspan(low, high, color="0.88", lw=0)
+            for y, name in enumerate(names):
+                share, error = rows[name][f"coverage_{key}"], rows[name][f"se_{key}"]
+                if share is None:
+                    continue
+                inside = low - 200 * error <= 100 * share <= high + 200 * error
+                ax.errorbar(100 * share, y, xerr=100 * error, fmt="o", ms=3.5, lw=1,
+                            color="C0" if inside else "C3")  # fmt: skip
+            ax.set_title(title, fontsize=9)
+            ax.set_xlim(30 if key == "68" else 55, 101)
+            ax.tick_params(labelsize=8)
+            ax.set_xlabel("true values inside [%]", fontsize=8)
+            ax.grid(axis="x", lw=0.3)
+        axes[0].set_yticks(range(len(names)), names)
+        axes[0].invert_yaxis()
 
 
 def _covered(row: dict[str, Any], level: str) -> str:
@@ -173,11 +160,8 @@ def cells(name: str, s: dict[str, Any]) -> list[str]:
     return [name, trials, *rms, *cover[:2], needed[0], cover[2], needed[1], median]
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/tables/worlds.csv and its figure; `needed`: the factor at which intervals hold as stated."""
-    found = load("calibration_worlds")
-    if found is None:
-        return None
     draw(found["rows"], FIGURE)
     return markdown(HEAD, [cells(name, s) for name, s in found["rows"].items()])
 

@@ -1,4 +1,4 @@
-"""Every numeric constant with its kind and reason, from its comment, into docs/tables/constants.csv.
+"""Write every numeric constant with its kind and reason, from its comment, to docs/tables/constants.csv.
 
     python -m experiments.constants
 
@@ -102,7 +102,7 @@ def constants(path: Path) -> Iterator[Constant]:
 
 
 def goes_on(text: str) -> bool:
-    """Whether a comment goes on with the one above it, rather than being that of the constant below."""
+    """Whether a comment continues the one above it, rather than describing the constant below."""
     return text[:1].islower() and STATED.match(text) is None
 
 

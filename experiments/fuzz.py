@@ -1,4 +1,4 @@
-"""Hostile input to every reader and command, in process: one line of InputError, or a result; nothing else.
+"""Hostile input to every reader and command, in process: each must give a result or a one-line InputError.
 
     python -m experiments.fuzz [--cases 100000] [--seed 0] [--commands 0.02] [--keep FOLDER]
 
@@ -57,7 +57,7 @@ STREAM = "lab.csv"  # what `watch` reads where its input is not the damaged file
 
 
 def one_case(scene: Scene, name: str, data: bytes, command: list[str] | None) -> str:
-    """ "read", "refused" or "exit N"; AssertionError or any other exception where the case fails."""
+    """ "read", "refused" or "exit N"; a case that fails raises AssertionError or another exception."""
     path = scene.folder / f"case-{name}"
     path.write_bytes(data)
     try:
@@ -101,7 +101,7 @@ def _command(scene: Scene, path: Path, command: list[str]) -> str:
 
 @contextlib.contextmanager
 def _standard_input(path: Path) -> Iterator[None]:
-    """A file in the place of standard input."""
+    """Replace standard input by a file."""
     usual = sys.stdin
     with path.open("rb") as file:
         sys.stdin = io.TextIOWrapper(io.BytesIO(file.read()))
@@ -126,7 +126,7 @@ def damaged(scene: Scene, rng: np.random.Generator) -> tuple[str, bytes]:
 
 
 def run(cases: int, seed: int, keep: Path | None = None, commands: float = 0.02, limit: int = 20) -> dict:
-    """Outcomes of so many cases, a share of them through the commands; at most `limit` failures are kept."""
+    """Outcomes of `cases` cases, a share of them run as `commands`; stops after `limit` failures."""
     outcomes: collections.Counter[str] = collections.Counter()
     failures: list[dict] = []
     here = Path.cwd()
@@ -158,16 +158,12 @@ def run(cases: int, seed: int, keep: Path | None = None, commands: float = 0.02,
                     )
         finally:
             os.chdir(here)
-    return {
-        "cases": sum(outcomes.values()) + len(failures),
-        "seed": seed,
-        "outcomes": dict(outcomes),
-        "failures": failures,
-    }
+    count = sum(outcomes.values()) + len(failures)
+    return {"cases": count, "seed": seed, "outcomes": dict(outcomes), "failures": failures}
 
 
 def main() -> int:
-    """Run and tell; 1 where a case failed."""
+    """Run and report; 1 if a case failed."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

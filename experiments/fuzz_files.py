@@ -205,12 +205,12 @@ Damage = Callable[[bytes, np.random.Generator], bytes]
 
 
 def cut(data: bytes, rng: np.random.Generator) -> bytes:
-    """The beginning of a file."""
+    """Keep only the beginning of a file."""
     return data[: int(rng.integers(0, len(data) + 1))]
 
 
 def flipped(data: bytes, rng: np.random.Generator) -> bytes:
-    """Some bytes replaced."""
+    """Replace some bytes."""
     out = np.frombuffer(data, np.uint8).copy()
     if out.size:
         at = rng.integers(0, out.size, int(rng.integers(1, 9)))
@@ -219,20 +219,20 @@ def flipped(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def shuffled(data: bytes, rng: np.random.Generator) -> bytes:
-    """Lines in another order, the first sometimes left."""
+    """Shuffle the lines, sometimes keeping the first."""
     lines = data.split(b"\n")
     keep = int(rng.integers(0, 2))
     return b"\n".join([*lines[:keep], *(lines[keep:][i] for i in rng.permutation(len(lines) - keep))])
 
 
 def doubled(data: bytes, rng: np.random.Generator) -> bytes:
-    """A stretch twice."""
+    """Repeat a stretch."""
     a, b = sorted(int(i) for i in rng.integers(0, len(data) + 1, 2))
     return data[:b] + data[a:b] + data[b:]
 
 
 def celled(data: bytes, rng: np.random.Generator) -> bytes:
-    """A few cells of a table replaced."""
+    """Replace a few cells of a table."""
     lines = data.split(b"\n")
     for _ in range(int(rng.integers(1, 4))):
         row = int(rng.integers(0, min(len(lines), 12)))
@@ -243,7 +243,7 @@ def celled(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def columned(data: bytes, rng: np.random.Generator) -> bytes:
-    """A column gone, all alike, or twice."""
+    """A column removed, made constant, or doubled."""
     rows = [line.split(b",") for line in data.split(b"\n")]
     at, kind = int(rng.integers(0, len(rows[0]))), int(rng.integers(0, 3))
     for row in rows:
@@ -258,7 +258,7 @@ def columned(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def tokened(data: bytes, rng: np.random.Generator) -> bytes:
-    """Tokens of TOML and JSON put in anywhere."""
+    """Insert tokens of TOML and JSON anywhere."""
     text = data.decode("utf-8", "replace")
     for _ in range(int(rng.integers(1, 4))):
         at = int(rng.integers(0, len(text) + 1))
@@ -267,7 +267,7 @@ def tokened(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def valued(data: bytes, rng: np.random.Generator) -> bytes:
-    """The value of a key replaced."""
+    """Replace the value of a key."""
     lines = data.split(b"\n")
     keys = [i for i, line in enumerate(lines) if b"=" in line]
     if keys:

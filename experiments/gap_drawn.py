@@ -20,14 +20,15 @@ from typing import Any
 from experiments.blind_check.diagnose import diagnose_folder
 from experiments.blind_check.judge import intervals_hold
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
+from simgap.attribution.verdict import RECORD
 
 RESULT = Path(__file__).parent / "results" / "gap_labs.json"
 WEAK = 0.3  # of the gap of held-out trials: causes that explain less are none
 
 
 def outcome(label: dict[str, Any], found: dict[str, Any]) -> str:
-    """What became of a case: `quiet`, `false alarm`, `named`, `set`, `beside others`, `half` (of a pair),
+    """The outcome of a case: `quiet`, `false alarm`, `named`, `set`, `beside others`, `half` (of a pair),
     `too small`, `unknown`, `wrong name`, `missed`, `error`."""
     if "error" in found:
         return "error"
@@ -56,7 +57,8 @@ def outcome(label: dict[str, Any], found: dict[str, Any]) -> str:
 
 
 def row(label: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
-    """A case's diagnosis in short; `gain` [nats] of the true effect by itself, None where it scatters."""
+    """Summary of a case's diagnosis; `gain` [nats] is that of the true effect alone, None if it is a
+    scatter."""
     gains = found.get("gains", {})
     return {
         "case": label["case"], "tier": label["tier"], "effects": label["effects"],
@@ -65,7 +67,35 @@ def row(label: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         "held_out": (found.get("shrinkage") or {}).get("fraction"),
         "probability": found.get("probabilities", {}).get("+".join(sorted(label["effects"])), 0.0),
         "seconds": round(found["seconds"], 1), "covered": covered(label, found),
+        "confidence": confidence(found),
     }  # fmt: skip
+
+
+def confidence(found: dict[str, Any]) -> float | None:
+    """The probability of what a diagnosis says; None where it ended in an error."""
+    if "error" in found:
+        return None
+    return found.get("probabilities", {}).get("+".join(found["causes"]) or found["verdict"])
+
+
+def is_right(r: dict[str, Any]) -> bool:
+    """Whether a verdict agrees with the label."""
+    return r["outcome"] in ("quiet", "named") or (r["tier"], r["outcome"]) == ("outside", "unknown")
+
+
+def reliability(rows: Sequence[dict[str, Any]], *verdicts: str) -> str:
+    """Mean probability of what verdicts say, and how many are right."""
+    of = [r for r in rows if r["verdict"] in verdicts and r.get("confidence") is not None]
+    if not of:
+        return ""
+    return f"{sum(r['confidence'] for r in of) / len(of):.2f}; {sum(map(is_right, of))} of {len(of)}"
+
+
+def record(rows: Sequence[dict[str, Any]]) -> float:
+    """Share of the named that is right over the mean of its probabilities within the catalogue
+    (`simgap.attribution.verdict.RECORD` is taken off)."""
+    of = [r for r in rows if r["verdict"] in ("named", "set") and r["confidence"] is not None]
+    return sum(map(is_right, of)) / max(sum(r["confidence"] for r in of) / RECORD, 1e-9)
 
 
 def covered(label: dict[str, Any], found: dict[str, Any]) -> list[bool]:
@@ -74,11 +104,8 @@ def covered(label: dict[str, Any], found: dict[str, Any]) -> list[bool]:
     return list(intervals_hold({**label, "effects": label["params"]}, found).values()) if ours else []
 
 
-def table(name: str = "gap_labs") -> str | None:
+def table(found: dict[str, Any]) -> str:
     """docs/gap_results.md: open labs, one column a version of the code, or a set of labs."""
-    found = load(name)
-    if not isinstance(found, dict):
-        return None
     runs: dict[str, list[dict[str, Any]]] = found["runs"]
 
     def line(name: str, tiers: Sequence[str], *which: str) -> list[str]:
@@ -108,6 +135,8 @@ def table(name: str = "gap_labs") -> str | None:
         line("pairs: one of both", ["pair"], "half"),
         line("outside: unknown", ["outside"], "unknown"),
         ["named with a held-out share below 0.3", *(weak(rows) for rows in runs.values())],
+        ["what is named: mean probability; right", *(reliability(r, "named", "set") for r in runs.values())],
+        ["none: mean probability; right", *(reliability(r, "none") for r in runs.values())],
         ["90 % intervals that hold the parameter", *(held(rows) for rows in runs.values())],
         ["seconds of processor, median",
          *(str(round(sorted(r["seconds"] for r in rows)[len(rows) // 2]) or "") for rows in runs.values())],
@@ -116,7 +145,7 @@ def table(name: str = "gap_labs") -> str | None:
         f"{r['case']} {' + '.join(r['effects'])} ({r['outcome']}{': ' if r['causes'] else ''}"
         f"{' + '.join(r['causes'])})"
         for r in list(runs.values())[-1]
-        if r["outcome"] not in ("quiet", "named") and (r["tier"], r["outcome"]) != ("outside", "unknown")
+        if not is_right(r)
     ]
     return (
         markdown(["figure", *runs], [each for each in lines if any(each[1:])])
@@ -154,6 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         runs.setdefault(options.run, []).append(one)
         print(*(one[k] for k in ("case", "effects", "outcome", "causes", "held_out")), flush=True)
     file = options.output
+    print(f"record of what is named: {record(runs[options.run]):.2f}")
     before = json.loads(file.read_text(encoding="utf-8"))["runs"] if file.exists() else {}
     save(file, {"runs": before | runs})
 

@@ -20,7 +20,7 @@ from estimation.report import read_actual
 from experiments.blind_check.tables import describe as describe_blind
 from experiments.recordings import Case, list_cases, read_case
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
 
@@ -29,7 +29,7 @@ TRIALS = 4
 
 
 def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dict[str, Any]:
-    """What one diagnosis found, and the processor and wall seconds it took."""
+    """Summary of a diagnosis, with its processor and wall time [s]."""
     actual = read_actual(folder / "actual.toml", case.task.objects) if measured else None
     start, busy = time.perf_counter(), time.process_time()
     aligned = align(case.trials[:TRIALS], case.task, case.rig)
@@ -46,11 +46,8 @@ def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dic
     }  # fmt: skip
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/gap_results.md: verdicts on labelled recordings."""
-    found = load("gap_recordings")
-    if found is None:
-        return None
     head = ["recording", "verdict without `actual`", "with `actual`", "parameters found (90 % interval)",
             "true", "time"]  # fmt: skip
     return markdown(head, [_row(row) for row in found["rows"]])
@@ -78,11 +75,8 @@ def _verdict(found: dict[str, Any]) -> str:
     return " + ".join(found["causes"]) or found["verdict"]
 
 
-def describe() -> str | None:
+def describe(found: dict) -> str:
     """docs/results.md: how often the diagnosis is right."""
-    found = load("gap_recordings")
-    if found is None:
-        return None
     rows = found["rows"]
     affected = [r for r in rows if r["effects"]]
     healthy = [r for r in rows if not r["effects"]]

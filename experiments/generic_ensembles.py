@@ -1,4 +1,4 @@
-"""Made-up ensembles of a plain ordered task with known effects: what the generic diagnosis is tested on.
+"""Synthetic ensembles of a plain ordered task with known effects, for tests of the generic diagnosis.
 
 Two channels, three subtasks; contacts change within a tenth of a second at whatever pace. Trials scatter
 in pace, size and offset. Effects are put into channel `fa` in the time domain, not through the

@@ -33,7 +33,7 @@ Json = Any  # what the json module reads and writes
 
 
 def rounded(value: Json, digits: int = 10) -> Json:
-    """The same with so many significant digits."""
+    """The value with floats rounded to `digits` significant digits."""
     if isinstance(value, dict):
         return {key: rounded(each, digits) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -42,7 +42,7 @@ def rounded(value: Json, digits: int = 10) -> Json:
 
 
 def identified(name: str) -> Json:
-    """Boundaries [s] with their 90 % intervals and properties of one folder of recordings/."""
+    """Boundaries [s] with 90 % intervals and properties identified in a folder of recordings/."""
     from estimation import identify
     from experiments.recordings import read_case
 
@@ -59,7 +59,7 @@ def identified(name: str) -> Json:
 
 
 def diagnosed(name: str) -> Json:
-    """What `diagnose` finds on one folder of recordings/, its properties measured apart."""
+    """Diagnosis of a folder of recordings/, given its measured properties."""
     from estimation.report import read_actual
     from experiments.recordings import read_case
     from hmmseg.segmentation.align import align
@@ -73,7 +73,7 @@ def diagnosed(name: str) -> Json:
 
 
 def ensembles(effect: str) -> Json:
-    """What the diagnosis of given trials finds where one effect is planted in six made-up ones."""
+    """Diagnosis of synthetic ensembles with one planted effect."""
     from experiments.generic_ensembles import PLANTED, made
     from simgap.generic.diagnose import diagnose as diagnose_ensembles
 
@@ -82,7 +82,7 @@ def ensembles(effect: str) -> Json:
 
 
 def summary(body: Json) -> Json:
-    """Of a diagnosis' document: verdict, probabilities, shares, parameters of the causes."""
+    """Verdict, probabilities, shares and parameters of the causes in a diagnosis."""
     causes = body["causes"]
     parameters = {
         f"{name}.{key}": [p["mean"], (p["interval_90"][1] - p["interval_90"][0]) / 3.29]
@@ -105,7 +105,7 @@ def folders() -> list[str]:
 
 
 def planted() -> list[str]:
-    """Names of the effects that are planted in ensembles, none among them."""
+    """Names of the effects planted in ensembles, and "none"."""
     from experiments.generic_ensembles import PLANTED
 
     return ["none", *PLANTED]
@@ -119,7 +119,7 @@ KINDS: dict[str, tuple[Callable[[], list[str]], Callable[[str], Json]]] = {
 
 
 def read(kind: str) -> dict[str, Json]:
-    """What is pinned of one kind, by case."""
+    """Pinned results of a kind, by case."""
     return json.loads((GOLDEN / f"{kind}.json").read_text(encoding="utf-8"))
 
 
@@ -131,7 +131,7 @@ def write(kind: str, rows: dict[str, Json]) -> None:
 
 
 def differences(old: Json, new: Json, exact: bool = False, where: str = "") -> Iterator[str]:
-    """One line for each place in which two results are not the same."""
+    """One line for each place where two results differ."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
             at = f"{where}.{key}" if where else key
@@ -153,8 +153,8 @@ def differences(old: Json, new: Json, exact: bool = False, where: str = "") -> I
 
 
 def _within(where: str, old: float) -> float:
-    """By how much a number at this place may move."""
-    if where.endswith("p_value"):  # which side of an alarm it is on, the verdict says
+    """Tolerance of a number at this place."""
+    if where.endswith("p_value"):  # the verdict shows on which side of an alarm it is
         return max(0.5 * abs(old), 0.1)
     return PLACE if "boundaries" in where else SHARE
 

@@ -97,7 +97,7 @@ class Page:
             self.call("Input.dispatchMouseEvent", type=kind, x=box[0], y=box[1], button="left", clickCount=1)
 
     def wait(self, seconds: float, picture: bool) -> None:
-        """Let so much played time pass, with a picture if wanted."""
+        """Wait for `seconds` of played time, taking pictures on request."""
         end = self.value("frame.t") + seconds
         while self.value("frame.t") < end:
             if picture and (not self.pictures or self.value("frame.t") - self.pictures[-1][0] > 0.2):
@@ -145,17 +145,9 @@ def _page(port: str, address: str) -> Iterator[Page]:
 
 @contextlib.contextmanager
 def served(folder: Path, *arguments: str) -> Iterator[str]:
-    """`hmmseg play` in a process of its own; the page's address."""
-    command = [
-        sys.executable,
-        "-m",
-        "hmmseg_cli.main",
-        "play",
-        *arguments,
-        "--output",
-        str(folder),
-        "--no-open",
-    ]
+    """Run `hmmseg play` in another process; the page's address."""
+    own = ["--output", str(folder), "--no-open"]
+    command = [sys.executable, "-m", "hmmseg_cli.main", "play", *arguments, *own]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             assert process.stdout is not None
@@ -186,12 +178,8 @@ def stack(page: Page, moved: str, onto: str, pictures: bool = False) -> None:
     page.wait(0.9, pictures)
     page.mouse("mousePressed", x, y)
     page.wait(0.9, pictures)
-    for place, seconds in (
-        ((x, high), 1.0),
-        ((there, high), 1.0),
-        ((there, rest + 0.004), 0.9),
-        ((there, rest - 0.003), 0.8),
-    ):
+    way = ((x, high, 1.0), (there, high, 1.0), (there, rest + 0.004, 0.9), (there, rest - 0.003, 0.8))
+    for *place, seconds in way:
         page.mouse("mouseMoved", *place)
         page.wait(seconds, pictures)
     page.mouse("mouseReleased", there, rest - 0.003)
@@ -201,7 +189,7 @@ def stack(page: Page, moved: str, onto: str, pictures: bool = False) -> None:
 
 
 def save(page: Page) -> str:
-    """Press the button; the file that the page says was saved."""
+    """Press the save button; the file that the page reports as saved."""
     page.click("save")
     return page.until("$('said').textContent.startsWith('saved ') && $('said').textContent.slice(6)")
 

@@ -35,7 +35,7 @@ class Case:
 
     @property
     def healthy(self) -> bool:
-        """Whether the recordings are known to have no effect on them."""
+        """Whether the recordings are known to be free of effects."""
         return self.effects == ("none",)
 
 
@@ -51,7 +51,7 @@ def list_cases(folder: Path) -> list[Path]:
 
 
 def read_case(folder: Path) -> Case:
-    """One case; true properties from labels.json next to it if that is there, else actual.toml."""
+    """Read a case; true properties come from a neighbouring labels.json if present, else actual.toml."""
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
     if not isinstance(task, BlockTask):
         raise InputError(str(folder / "task.toml"), "is a plain ordered task", "objects and moves")
@@ -75,7 +75,7 @@ def read_case(folder: Path) -> Case:
 
 
 def read_boundaries(path: Path) -> tuple[float, ...] | None:
-    """True boundaries [s] of a file in truth/, NaN of one that never came; None without the file."""
+    """True boundaries [s] from a file in truth/, NaN if one never occurred; None without the file."""
     if not path.exists():
         return None
     times = json.loads(path.read_text(encoding="utf-8"))["boundaries"]

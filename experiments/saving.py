@@ -1,9 +1,11 @@
-"""Results as JSON, with the commit of the code that made them."""
+"""Results as JSON with the commit of the code that made them, and plain figures of them."""
 
 from __future__ import annotations
 
 import json
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,22 @@ def commit_of(root: Path = ROOT) -> str | None:
 
 
 def save(path: Path, document: dict[str, Any]) -> None:
-    """Write a result with `made_by`, the commit of this code; ValueError where it holds NaN."""
+    """Write a result with `made_by`, the commit of this code; ValueError if it contains NaN."""
     text = json.dumps({**document, "made_by": commit_of()}, indent=1, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text + "\n", encoding="utf-8")
+
+
+@contextmanager
+def panels(path: Path, *shape: int, **options: Any) -> Iterator[Any]:
+    """The axes of a figure (arguments of `matplotlib.pyplot.subplots`), which is then saved to `path`."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(*shape, layout="constrained", **options)
+    yield axes
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -25,8 +25,8 @@ from estimation import priors
 from estimation.design import PROPERTIES, Design, Nuisance, Unknown
 from estimation.posterior import posterior
 from estimation.sampler import sample
-from experiments.saving import save
-from experiments.table_text import load, markdown, percent
+from experiments.saving import panels, save
+from experiments.table_text import markdown, percent
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "sbc.json"
@@ -38,7 +38,7 @@ BIAS, WIDER = 0.02, 3e-5  # of one sd of two deviations: a bias of force [N], a 
 
 
 def design_of(blocks: int, trials: int, rng: np.random.Generator) -> Design:
-    """One grip a block and trial, each with its means and slopes; the data are still to be drawn."""
+    """A design with one grip per block and trial, with means and slopes but without data."""
     unknowns = tuple(Unknown(prop, {f"b{k}": 1}) for k in range(blocks) for prop in PROPERTIES)
     rows = [(t, m, c, s) for s in (0, 1) for t in range(trials) for m in range(blocks) for c in range(3)
             if s == 0 or c > 0]  # fmt: skip
@@ -68,7 +68,7 @@ def _unread(trial: Any, rig: Any, size: float) -> Any:
 
 
 def drawn(design: Design, rng: np.random.Generator) -> tuple[Design, np.ndarray]:
-    """The design with data drawn from the model, and the properties (Q,) they were drawn of."""
+    """The design with data drawn from the model, and the true properties (Q,)."""
     d = design
     mean, sd = priors.property_priors([(u.name[0], u.prop) for u in d.unknowns])
     true = np.exp(mean + sd * rng.normal(size=mean.size))
@@ -125,11 +125,8 @@ def ranked(first: int, num: int) -> list[dict[str, Any]]:
     return out
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/tables/sbc.csv: ranks of drawn data sets."""
-    found = load("sbc")
-    if found is None:
-        return None
     rows = [[prop, f"{s['count']}", f"{s['p_value']:.2f}", percent(s["coverage_68"], 1),
              percent(s["coverage_95"], 1)] for prop, s in found["properties"].items()]  # fmt: skip
     return markdown(["property", "data sets", "p of uniform ranks", "68 % cover", "95 % cover"], rows)
@@ -163,23 +160,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def draw(document: dict[str, Any], path: Path) -> None:
     """Rank histograms with the band that holds all bins of a uniform one in 99 % of figures."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(9, 2.4), sharey=True, layout="constrained")
-    for ax, (prop, s) in zip(axes, document["properties"].items(), strict=True):
-        level = 1 - 0.99 ** (1 / (3 * BINS))  # all bins of all panels together
-        low, high = stats.binom.ppf([level / 2, 1 - level / 2], s["count"], 1 / BINS)
-        ax.axhspan(low, high, color="0.88", lw=0)
-        ax.stairs(s["bins"], np.linspace(0, 1, BINS + 1), fill=True, alpha=0.7)
-        ax.set_title(f"{prop}, p {s['p_value']:.2f}", fontsize=9)
-        ax.set_xlabel("rank of the true value", fontsize=8)
-    axes[0].set_ylabel("data sets", fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with panels(path, 1, 3, figsize=(9, 2.4), sharey=True) as axes:
+        for ax, (prop, s) in zip(axes, document["properties"].items(), strict=True):
+            level = 1 - 0.99 ** (1 / (3 * BINS))  # all bins of all panels together
+            low, high = stats.binom.ppf([level / 2, 1 - level / 2], s["count"], 1 / BINS)
+            ax.axhspan(low, high, color="0.88", lw=0)
+            ax.stairs(s["bins"], np.linspace(0, 1, BINS + 1), fill=True, alpha=0.7)
+            ax.set_title(f"{prop}, p {s['p_value']:.2f}", fontsize=9)
+            ax.set_xlabel("rank of the true value", fontsize=8)
+        axes[0].set_ylabel("data sets", fontsize=8)
 
 
 if __name__ == "__main__":

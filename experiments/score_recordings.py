@@ -26,7 +26,7 @@ from experiments.scoring import (
     summarise_boundaries,
     summarise_properties,
 )
-from experiments.table_text import load, markdown, milliseconds, percent
+from experiments.table_text import markdown, milliseconds, percent
 from hmmseg.contact.decompose import Subtask, subtasks
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import (
@@ -39,6 +39,7 @@ from hmmseg.segmentation.thresholds import (
 )
 
 RESULTS = Path(__file__).parent / "results"
+SAVED = "score_hmm score_qualitative score_first-change"  # results that the table is made of
 HEAD = ("trials complete", "boundary, median", "95th percentile", *PROPERTIES)
 Method = Callable[[Case, slice, int], tuple[Sequence[Segmentation], dict]]
 
@@ -130,16 +131,12 @@ def cells(s: dict) -> list[str]:
     return [f"{s['complete']} of {s['trials']}", *times, *rms]
 
 
-def table() -> str | None:
+def table(*found: dict) -> str:
     """docs/results.md: the model against the paper's method, on every recording."""
-    methods = {"hmm": "this model", "qualitative": "thresholds, best monotone order",
-               "first-change": "thresholds, first change (the paper)"}  # fmt: skip
+    labels = "this model", "thresholds, best monotone order", "thresholds, first change (the paper)"
     rows = []
-    for name, label in methods.items():
-        found = load(f"score_{name}")
-        if found is None:
-            return None
-        rows += [[label, group, *cells(found["summary"][group])] for group in ("healthy", "all")]
+    for label, one in zip(labels, found, strict=True):
+        rows += [[label, group, *cells(one["summary"][group])] for group in ("healthy", "all")]
     return markdown(["method", "recordings", *HEAD], rows)
 
 

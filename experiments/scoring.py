@@ -11,7 +11,7 @@ from hmmseg.segmentation.spans import Segmentation
 
 
 def boundary_residuals(segmentation: Segmentation, truth: Sequence[float]) -> np.ndarray:
-    """Boundary times less the true ones (num_boundaries,) [s]; NaN all over if spans are missing."""
+    """Boundary times minus the true ones (num_boundaries,) [s]; all NaN if spans are missing."""
     starts = [span.start for span in segmentation.spans[1:]]
     if len(starts) != len(truth):
         return np.full(len(truth), np.nan)
@@ -19,7 +19,7 @@ def boundary_residuals(segmentation: Segmentation, truth: Sequence[float]) -> np
 
 
 def boundaries_covered(segmentation: Segmentation, truth: Sequence[float]) -> np.ndarray:
-    """Whether each 90 % interval holds the true boundary, 1 or 0; NaN all over if spans are missing."""
+    """Whether each 90 % interval contains the true boundary, 1 or 0; all NaN if spans are missing."""
     intervals = [span.start_90 for span in segmentation.spans[1:]]
     if len(intervals) != len(truth):
         return np.full(len(truth), np.nan)
@@ -61,7 +61,7 @@ def property_scores(properties: dict, blocks: dict[str, dict[str, tuple[float, f
 
 
 def summarise_boundaries(residuals: np.ndarray, covered: np.ndarray) -> dict:
-    """Median and 95th percentile of |residual| [s] and coverage, over what is not NaN."""
+    """Median and 95th percentile of |residual| [s] and coverage, ignoring NaN."""
     there = np.isfinite(residuals)
     if not there.any():
         return {"median": None, "percentile_95": None, "coverage_90": None}

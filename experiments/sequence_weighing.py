@@ -1,4 +1,4 @@
-"""What makes a choice among the changes of plain sequences probable: learned on drawn worlds.
+"""Weights of the choices among changes of plain sequences, learned on drawn worlds.
 
 By maximum likelihood of the true boundaries, whose density is the mixture over courses and choices that
 `hmmseg segment` answers with (hmmseg.sequence.courses.Weighing): first without labels, then, for how far
@@ -19,7 +19,7 @@ from hmmseg.sequence.courses import (
     COARSE_CELLS,
     Course,
     Weighing,
-    coarse,
+    coarsen,
     find_courses,
     naming,
     probabilities,
@@ -41,7 +41,7 @@ def known(world: World, labelled: int) -> Known:
     truth = np.array([each.shares(b) for each, b in zip(data, world.boundaries, strict=True)])
     labels = np.where(np.arange(len(truth))[:, None] < labelled, truth, np.nan)
     found = find_courses(
-        [coarse(each.values, factor) for each in data], len(world.task.sequence), list(labels)
+        [coarsen(each.values, factor) for each in data], len(world.task.sequence), list(labels)
     )
     return found, labels, truth
 
@@ -65,7 +65,7 @@ def log_score(cases: list[Known], weighing: Weighing) -> float:
 
 
 def weighing_of(x: np.ndarray) -> Weighing:
-    """The weighing of parameters without bounds."""
+    """The weighing at unconstrained parameters."""
     return Weighing(
         independent=float(np.exp(x[0])), settled=float(x[1]), shares=float(x[2]),
         lag=float(np.exp(x[3])), labelled=float(np.exp(x[3])), elsewhere=float(expit(x[4])),
@@ -74,7 +74,7 @@ def weighing_of(x: np.ndarray) -> Weighing:
 
 
 def learn(worlds: list[World]) -> Weighing:
-    """Find and print what weighs choices best."""
+    """Fit and print the weighing."""
     worlds = [world for world in worlds if len(world.task.sequence) > 1]
     cases = [known(world, 0) for world in worlds]
     best: Any = minimize(lambda x: -log_score(cases, weighing_of(x)), np.array(START), method="BFGS",

@@ -1,8 +1,8 @@
 """Plain sequences of many kinds, drawn at random, with their true boundaries.
 
-What makes real ones hard is in them: coloured and heavy-tailed noise, drifts, transients after an event,
-states nearly alike, states with phases of their own that nobody named, something that settles after the
-last event, trials cropped at their start, channels that tell nothing.
+They contain the difficulties of real recordings: coloured and heavy-tailed noise, drifts, transients after
+events, nearly equal states, states with unnamed phases of their own, settling after the last event, trials
+cropped at their start, and uninformative channels.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hmmseg.io.trial import Trial
 CELLS = (300, 900)  # chosen: samples of a trial
 STATES = (2, 10)  # chosen: of a task, fewest and most
 TRIALS = (1, 8)  # chosen: fewest and most
-LAG = 0.01  # chosen: of a trial; a controller's labels lie off what its channels show, the same in all trials
+LAG = 0.01  # chosen: share of a trial; a controller's labels have a common lag to what channels show
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class World:
 
 
 def draw(seed: int, alike: float | None = None) -> World:
-    """One world; `alike`: how far neighbouring states differ, in standard deviations of the noise."""
+    """One world; `alike` is the difference of neighbouring states in standard deviations of the noise."""
     rng = np.random.default_rng(seed)
     num_states = int(rng.integers(STATES[0], STATES[1] + 1))
     num_trials = int(rng.integers(TRIALS[0], TRIALS[1] + 1))
@@ -99,7 +99,7 @@ def abrupt(seed: int) -> World:
 
 
 def _phases(rng: np.random.Generator) -> np.ndarray:
-    """Shares of a state's duration that its phases take; mostly one."""
+    """Shares of a state's duration for its phases; mostly one."""
     return rng.dirichlet(np.full(rng.choice([1, 2, 3], p=[0.5, 0.3, 0.2]), 3.0))
 
 

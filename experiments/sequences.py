@@ -1,4 +1,4 @@
-"""Plain sequences without labels: are places and probabilities honest, and what does one label do?
+"""Plain sequences without labels: accuracy and calibration of boundaries, and the effect of one label.
 
     python -m experiments.sequences check [--worlds N] [--seed S] [--real FOLDER] [--panda FOLDER]
     python -m experiments.sequences learn [--worlds N] [--seed S]
@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from experiments.real import hiro_snap
-from experiments.saving import save
+from experiments.saving import panels, save
 from experiments.sequence_worlds import World, abrupt, draw
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation, most_telling
@@ -41,7 +41,7 @@ BINS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95, 1.01)
 
 @dataclass(frozen=True)
 class Case:
-    """Trials with true boundaries; `scored`: which of them the truth is known of."""
+    """Trials with true boundaries; `scored` are the indices of the known ones."""
 
     name: str
     group: str
@@ -50,7 +50,7 @@ class Case:
 
 
 def drawn(first: int, count: int) -> list[Case]:
-    """Fresh worlds, of many kinds and of abrupt changes alone."""
+    """Newly drawn worlds: of many kinds, and with abrupt changes only."""
     cases = []
     for group, make in (("drawn", draw), ("abrupt", abrupt)):
         for seed in range(first, first + count):
@@ -90,7 +90,7 @@ def wrists(folder: Path) -> list[Case]:
 
 
 def hands(folders: list[Path]) -> list[Case]:
-    """A two-finger hand's recordings of blocks, by all their channels as they come, four trials of each."""
+    """Block recordings of a two-finger hand, with all their raw channels, four trials of each."""
     cases = []
     for each in folders:
         files = sorted(each.glob("trial_*.csv"))[:MOST_TRIALS]
@@ -103,7 +103,7 @@ def hands(folders: list[Path]) -> list[Case]:
 
 
 def answers(case: Case) -> dict:
-    """Scores without labels, with the one label that was suggested, with one labelled trial."""
+    """Scores without labels, with the one suggested label, and with one labelled trial."""
     world = case.world
     model = fit_sequence(world.trials, world.task)
     blind = segment_sequence(world.trials, world.task, model)
@@ -124,7 +124,7 @@ def answers(case: Case) -> dict:
 
 
 def score(case: Case, found: list[Segmentation], without: int | None = None) -> dict:
-    """Errors as shares of the trial, coverage, and what was said of the places; one entry a boundary.
+    """Errors as shares of the trial, coverage, and stated probabilities of places; one entry per boundary.
 
     `place`: probability of the place given, and whether the truth is nearer to it than to any other (within
     its 90 % interval's width of 2 % of the trial at least); `listed`: the truth is at one of these places.
@@ -153,7 +153,7 @@ def score(case: Case, found: list[Segmentation], without: int | None = None) -> 
 
 
 def summary(scores: list[dict]) -> dict:
-    """Over all boundaries of some cases."""
+    """Summary over all boundaries of some cases."""
     rows = [row for each in scores for row in each["boundaries"]]
     if not rows:
         return {}
@@ -179,7 +179,7 @@ def summary(scores: list[dict]) -> dict:
 
 
 def check(cases: list[Case]) -> dict:
-    """All cases, printed as they come."""
+    """Score all cases, printing each."""
     rows = []
     for case in cases:
         row = answers(case)
@@ -207,11 +207,8 @@ def check(cases: list[Case]) -> dict:
     return {"groups": groups, "cases": each}
 
 
-def table() -> str | None:
-    """A row for each group of cases and what was known; draws the figure."""
-    found = load("sequences")
-    if found is None:
-        return None
+def table(found: dict) -> str:
+    """A row for each group of cases and kind of labels; draws the figure."""
     rows = []
     for group, entry in found["groups"].items():
         for key, label in ROWS.items():
@@ -234,28 +231,20 @@ def table() -> str | None:
 
 
 def _draw(groups: dict[str, Any], path: Path) -> None:
-    """Reliability: probability said of places without labels, and the share that were true."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, ax = plt.subplots(figsize=(4.2, 4.0), layout="constrained")
-    ax.plot([0, 1], [0, 1], color="0.6", lw=0.8)
-    for group, entry in groups.items():
-        bins = entry["none"]["reliability"]
-        ax.plot([b["said"] for b in bins], [b["true"] for b in bins], "-", lw=0.8, label=group)
-        ax.scatter(
-            [b["said"] for b in bins],
-            [b["true"] for b in bins],
-            s=[3 + 40 * b["count"] / max(each["count"] for each in bins) for b in bins],
-        )
-    ax.set_xlabel("probability said of a place")
-    ax.set_ylabel("share that were true")
-    ax.legend(fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    """Plot reliability: stated probability of places without labels against the share that were true."""
+    with panels(path, figsize=(4.2, 4.0)) as ax:
+        ax.plot([0, 1], [0, 1], color="0.6", lw=0.8)
+        for group, entry in groups.items():
+            bins = entry["none"]["reliability"]
+            ax.plot([b["said"] for b in bins], [b["true"] for b in bins], "-", lw=0.8, label=group)
+            ax.scatter(
+                [b["said"] for b in bins],
+                [b["true"] for b in bins],
+                s=[3 + 40 * b["count"] / max(each["count"] for each in bins) for b in bins],
+            )
+        ax.set_xlabel("probability said of a place")
+        ax.set_ylabel("share that were true")
+        ax.legend(fontsize=8)
 
 
 def main() -> None:

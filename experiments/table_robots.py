@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 
 GOALS = {
     "false_alarms": ("false alarms on healthy robots", "2 %"),
@@ -17,11 +17,17 @@ GOALS = {
 }
 
 
-def minute() -> str | None:
+def _share(one: dict[str, Any]) -> list[str]:
+    """Two cells of a proportion: its count, and its percentage with the 90 % interval."""
+    low, high = (100 * v for v in one["interval_90"])
+    return [
+        f"{one['hits']} of {one['of']}",
+        f"{100 * one['hits'] / one['of']:.0f} % ({low:.0f} to {high:.0f})",
+    ]
+
+
+def minute(found: dict) -> str:
     """How long a minute of an arm takes."""
-    found = load("benchmark_robot")
-    if found is None:
-        return None
     whole = found["whole"]
     rows = [["in one go", f"{whole['processor']:.0f} s", f"{whole['wall']:.0f} s"]]
     note = (
@@ -33,20 +39,15 @@ def minute() -> str | None:
     return f"{markdown(['', 'processor', 'time'], rows)}\n\n{note}"
 
 
-def check() -> str | None:
+def check(found: dict) -> str:
     """Seeded faults in robots by others."""
-    found = load("robots_check")
-    if found is None:
-        return None
     shares: dict[str, Any] = {**found, **found["named_right_by_kind"]}
     rows = []
     for key, (label, goal) in GOALS.items():
         one = shares[key]
         if not one["of"]:
             continue
-        low, high = (100 * v for v in one["interval_90"])
-        share = f"{100 * one['share']:.0f} % ({low:.0f} to {high:.0f})"
-        rows.append([label, f"{one['hits']} of {one['of']}", share, goal])
+        rows.append([label, *_share(one), goal])
     seconds = ", ".join(f"{robot} {s:.0f} s" for robot, s in found["processor_seconds"].items())
     cases = [c["robot"] for c in found["each"]]
     counts = ", ".join(f"{robot} {cases.count(robot)}" for robot in found["robots"])
@@ -59,16 +60,9 @@ def check() -> str | None:
     return f"{markdown(['', 'of', 'share', 'goal'], rows)}\n\n{note}"
 
 
-def changed() -> str | None:
+def changed(found: dict) -> str:
     """What changed of a servo."""
-    found = load("sts3215")
-    if found is None:
-        return None
-    rows = []
-    for one in found["figures"]:
-        low, high = (100 * v for v in one["interval_90"])
-        share = f"{100 * one['hits'] / one['of']:.0f} % ({low:.0f} to {high:.0f})"
-        rows.append([one["figure"], f"{one['hits']} of {one['of']}", share, one["goal"]])
+    rows = [[one["figure"], *_share(one), one["goal"]] for one in found["figures"]]
     seconds = sorted(c["seconds"] for c in found["cases"])
     note = (
         f"{len(found['cases'])} cases, {found['drawn']} of a kind at most, of part `{found['part']}` of the "
@@ -78,11 +72,8 @@ def changed() -> str | None:
     return f"{markdown(['', 'of', 'share', 'goal'], rows)}\n\n{note}"
 
 
-def bam() -> str | None:
+def bam(found: dict) -> str:
     """Whole logs of what was left out, of three models."""
-    found = load("sts3215_bam")
-    if found is None:
-        return None
     rows = []
     for by, words in (("kp", "one gain of three"), ("mass", "one mass of two")):
         one = found.get(by, {"compared": []})
@@ -96,11 +87,8 @@ def bam() -> str | None:
     return f"{markdown(head, rows)}\n\n{note}"
 
 
-def given() -> str | None:
+def given(found: dict) -> str:
     """Faulty robots of another generator, case by case."""
-    found = load("robots_check_given")
-    if found is None:
-        return None
     rows = []
     for name, one in found.items():
         if not isinstance(one, dict):

@@ -1,4 +1,4 @@
-"""What the tables of README.md and docs/ are made with: results by name, cells, Markdown."""
+"""Helpers for the tables of README.md and docs/: results by name, cells, Markdown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def load(name: str) -> dict | None:
-    """A result by its file's stem, None where it was not written yet."""
+    """A saved result by its file's stem; None if it was not written yet."""
     path = RESULTS / f"{name}.json"
     return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
@@ -24,7 +24,7 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def as_csv(text: str) -> str:
-    """The tables of a text as comma-separated values; what stands between them are lines of one cell."""
+    """The tables of a text as comma-separated values; text between them becomes lines of one cell."""
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
     for line in filter(None, map(str.strip, text.splitlines())):

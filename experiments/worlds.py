@@ -1,4 +1,4 @@
-"""The labs of the calibrations: the usual hand and task, and how what is recorded there may differ.
+"""The labs of the calibrations: the usual hand and task, and the ways in which recordings differ.
 
 `World` says how a lab differs (rate, pace, noise, ringing contacts, lost values, towers, pads, errors that
 its rig states or does not, hands that are not tidy), and `replicates` records trials there, with their truth;
@@ -18,19 +18,19 @@ import numpy as np
 
 from experiments.recordings import Case
 from hmmseg.hand.kinematics import inverse, joint_velocity
-from hmmseg.hand.signals import Signals, task_space
+from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Fingertip, Noise, Rig, Systematic, read_rig
 from hmmseg.io.task import BlockTask, parse_task, read_task
 from hmmseg.io.trial import Trial
 from simgap.gap.twins import recorded
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.operator import OperatorSettings, Plan, Window, minimum_jerk
-from simgap.world.properties import Block, random_properties
+from simgap.world.properties import Block
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 SCENE = Path(__file__).parent / "scene"
 SHEAR_SHARE = 0.625  # shear over normal stiffness of the usual pads
-BIAS = 0.02  # N, what [systematic] admits where a world has biases
+BIAS = 0.02  # N; standard deviation under [systematic] in worlds with biases
 PADS = 0.3  # share, likewise of pads
 HAND = Systematic(force_bias=(0.01,) * 4, force_gain=(0.01,) * 4, joint_offset=(0.001,) * 4,
                   link_length=(0.001,) * 4, pad_stiffness=(0.1, 0.1))  # fmt: skip
@@ -47,7 +47,7 @@ def scene(rate: float | None = None) -> tuple[Rig, BlockTask]:
 
 
 def task_of(blocks: int) -> BlockTask:
-    """A tower of so many blocks reversed; one block is moved on the ground."""
+    """The task of reversing a tower of `blocks`; a single block is moved on the ground."""
     if blocks == 2:
         return scene()[1]
     names = [f"b{k}" for k in range(blocks)]
@@ -58,9 +58,19 @@ def task_of(blocks: int) -> BlockTask:
     return task
 
 
+def random_properties(task: BlockTask, seed: int) -> dict[str, Block]:
+    """Draw blocks for every object of a task from what two fingers can handle.
+
+    Uniform: weights 0.25-0.65 N, widths 14-29 mm, heights 12-19 mm, friction 1.0-1.4.
+    """
+    rng = np.random.default_rng([seed, 1])
+    return {name: Block(rng.uniform(0.25, 0.65), rng.uniform(0.014, 0.029), rng.uniform(0.012, 0.019),
+                        rng.uniform(1.0, 1.4)) for name in task.objects}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Cell:
-    """One condition of the sensors and of the work.
+    """One condition of sensors and work.
 
     `noise` and `pace` (rate of work) in units of the usual ones; `rate` [Hz]; `vibration` [N], its
     amplitude at a contact change; `missing`, the share of the recording's values that are lost.
@@ -144,7 +154,7 @@ class Judged:
 
 
 def replicates(world: World, numbers: Sequence[int]) -> Iterator[Replicate]:
-    """Replicates of a world by their numbers, each the same whatever its company."""
+    """Replicates of a world by number, each independent of the others drawn with it."""
     task, sensors = task_of(world.blocks), sensors_of(world)
     seeds = [100 * number + k for number in numbers for k in range(world.trials)]
     done = iter(_happens(world, [n for n in numbers for _ in range(world.trials)], seeds))
@@ -156,7 +166,7 @@ def replicates(world: World, numbers: Sequence[int]) -> Iterator[Replicate]:
 
 
 def trials_of(world: World, numbers: Sequence[int]) -> list[Judged]:
-    """Single trials of a world by their numbers, which seed their operators too."""
+    """Single trials of a world by number, which also seeds the operator."""
     task, sensors = task_of(world.blocks), sensors_of(world)
     return [
         Judged(_recorded(world, s, task, sensors, number), _stated(world, sensors), s.boundaries)
@@ -165,7 +175,7 @@ def trials_of(world: World, numbers: Sequence[int]) -> list[Judged]:
 
 
 def sensors_of(world: World) -> Rig:
-    """The hand that records: the world's pads as the rig states them, its rate and true noise."""
+    """The recording hand: the world's pads as stated, its rate and true noise."""
     pads = Fingertip(normal_stiffness=world.pads, shear_stiffness=SHEAR_SHARE * world.pads)
     rig = scene()[0]
     noise = {name: sd * world.cell.noise for name, sd in rig.noise.model_dump(exclude_none=True).items()}
@@ -173,7 +183,7 @@ def sensors_of(world: World) -> Rig:
 
 
 def _happens(world: World, numbers: Sequence[int], seeds: Sequence[int]) -> list[SimulatedTrial]:
-    """What truly happens, a trial for each pair; worlds that differ by their sensors alone share it."""
+    """The true trials, one per pair; worlds that differ only in their sensors share them."""
     stiffness = world.pads * world.softer
     true = {"normal_stiffness": stiffness, "shear_stiffness": SHEAR_SHARE * stiffness}
     true |= world.effects.get("fingertip_compliance", {})
@@ -202,7 +212,7 @@ def _recorded(world: World, simulated: SimulatedTrial, task: BlockTask, rig: Rig
         clean = recorded(resampled, task, rig.model_copy(update={"noise": Noise(**quiet)}), {})
         trial = _coloured(trial, clean, world.coloured)
     trial = disturbed(trial, simulated.boundaries, world.cell, simulated.seed)
-    rng = np.random.default_rng([number, 6])  # of the hand: all trials of a replicate alike
+    rng = np.random.default_rng([number, 6])  # one hand for all trials of a replicate
     if world.bias:
         signs = world.bias * BIAS * rng.choice([-1.0, 1.0], 4)
         shifted = {n: trial.channels[n] + b for n, b in zip(FORCE_CHANNELS, signs, strict=True)}
@@ -271,13 +281,13 @@ def _row(t: float) -> int:
 
 
 def _pulse(n: int) -> np.ndarray:
-    """There and back (n,) by minimum-jerk motions."""
+    """A pulse (n,) from 0 to 1 and back by minimum-jerk motions."""
     phase = np.linspace(0.0, 1.0, n)
     return minimum_jerk(2 * phase) - minimum_jerk(2 * phase - 1)
 
 
 def _inserted(plan: Plan, at: float, change: np.ndarray) -> Plan:
-    """The plan with a pause at `at` [s]; `change` (n, 4) [m] is added to what is commanded in it."""
+    """The plan with a pause at `at` [s], during which `change` (n, 4) [m] is added to the command."""
     k, longer = _row(at), len(change) * CONTROL_PERIOD
     command = np.concatenate([plan.command[:k], plan.command[k] + change, plan.command[k:]])
 
@@ -301,7 +311,7 @@ def late_finger(plan: Plan, rng: np.random.Generator) -> Plan:
 
 
 def tapping(plan: Plan, rng: np.random.Generator) -> Plan:
-    """The fingers touch a block for a moment before they grip it, every time."""
+    """The fingers touch each block briefly before they grip it."""
     for k in range(len(plan.windows)):
         w = plan.windows[k]
         row, after = plan.command[_row(w.close)], plan.command[_row(w.lift) - 1]
@@ -315,7 +325,7 @@ def tapping(plan: Plan, rng: np.random.Generator) -> Plan:
 
 
 def slipping(plan: Plan, rng: np.random.Generator) -> Plan:
-    """The grip loosens in mid-carry for a moment, the block slips a little and is held again."""
+    """The grip loosens briefly in mid-carry; the block slips a little and is held again."""
     for k in range(len(plan.windows)):
         w = plan.windows[k]
         open_, held = plan.command[_row(w.close)], plan.command[_row(w.lift) - 1]
@@ -346,14 +356,14 @@ class Deviations:
 
 
 def draw_deviations(systematic: Systematic, rng: np.random.Generator) -> Deviations:
-    """One hand: every deviation normal with its standard deviation from the table."""
+    """Draw a hand, every deviation normal with its standard deviation from the table."""
     names = Deviations.__dataclass_fields__
     return Deviations(**{n: rng.normal(0.0, np.asarray(getattr(systematic, n))) for n in names})
 
 
 def simulated_cases(num: int, trials: int = 4, seed: int = SEED, systematic: Systematic | None = None,
                     rate: float | None = None) -> list[Case]:  # fmt: skip
-    """`num` cases of `trials` trials each; reproducible from their seeds, whatever their company."""
+    """`num` cases of `trials` trials each, each reproducible from its own seed."""
     rig, task = scene(rate)
     blocks = [random_properties(task, seed + i) for i in range(num)]
     seeds = [100 * (seed + i) + k for i in range(num) for k in range(trials)]
@@ -385,11 +395,10 @@ def deviated(trial: Trial, rig: Rig, hand: Deviations) -> Trial:
     signals, channels = task_space(trial, rig), dict(trial.channels)
     for i in (1, 2):
         give = 1 / (1 + hand.pad_stiffness[i - 1]) - 1
-        tip = np.stack([
-            _of(signals, f"x{i}") + _of(signals, f"fx{i}") / rig.fingertip.normal_stiffness * give,
-            _of(signals, f"y{i}") + _of(signals, f"fy{i}") / rig.fingertip.shear_stiffness * give,
-        ], axis=1)  # fmt: skip
-        speed = np.stack([_of(signals, f"vx{i}"), _of(signals, f"vy{i}")], axis=1)
+        x, y, vx, vy, fx, fy = (getattr(signals, f"{n}{i}") for n in ("x", "y", "vx", "vy", "fx", "fy"))
+        pad = rig.fingertip
+        tip = np.stack([x + fx / pad.normal_stiffness * give, y + fy / pad.shear_stiffness * give], axis=1)
+        speed = np.stack([vx, vy], axis=1)
         nominal_finger = rig.finger(i)
         first, second = np.asarray(nominal_finger.links) * (1 + hand.link_length[2 * i - 2 : 2 * i])
         finger = nominal_finger.model_copy(update={"links": (float(first), float(second))})
@@ -401,7 +410,3 @@ def deviated(trial: Trial, rig: Rig, hand: Deviations) -> Trial:
     for k, name in enumerate(FORCE_CHANNELS):
         channels[name] = (1 + hand.force_gain[k]) * channels[name] + hand.force_bias[k]
     return replace(trial, channels=channels)
-
-
-def _of(signals: Signals, name: str) -> np.ndarray:
-    return getattr(signals, name)

@@ -1,4 +1,4 @@
-"""Grippers with a wrist sensor: an arm of another simulator, and labs of every kind from our own.
+"""Grippers with a wrist sensor: an arm of another simulator, and many setups of our own.
 
     python -m experiments.wrist [FOLDER with wrist_restack_1 and wrist_untared]
 
@@ -26,7 +26,7 @@ from experiments.scoring import (
     summarise_boundaries,
     summarise_properties,
 )
-from experiments.table_text import RESULTS, load, markdown, milliseconds, percent
+from experiments.table_text import RESULTS, markdown, milliseconds, percent
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
@@ -65,7 +65,7 @@ SETUPS: dict[str, tuple[Setup, dict]] = {
 
 
 def score(recordings: Sequence, rig: Rig, task: BlockTask, truths: Sequence, blocks: dict) -> dict:
-    """One case: what is found in recordings against known boundaries [s] and blocks."""
+    """Score a case: recordings against known boundaries [s] and blocks."""
     try:
         aligned = align([read_trial(each, rig) for each in recordings], task, rig)
         found = identify_aligned(aligned)
@@ -84,7 +84,7 @@ def score(recordings: Sequence, rig: Rig, task: BlockTask, truths: Sequence, blo
 
 
 def arm(folder: Path) -> dict[str, dict]:
-    """The arm's four trials: from the wrist, tared or not, and as two fingers made up from it."""
+    """The arm's four trials: from the wrist, tared or not, and as two fingers synthesised from it."""
     cases = {}
     source = folder / "wrist_restack_1"
     files = sorted(source.glob("wrist_*.csv"))
@@ -114,7 +114,7 @@ def _offset(file: Path) -> dict[str, np.ndarray]:
 
 
 def synthetic(name: str, count: int, seed: int = 0) -> dict:
-    """Trials of one setup, of an own performance."""
+    """Score `count` simulated trials of a setup."""
     setup, said = SETUPS[name]
     performed = performances(count, seed=seed)
     recordings = [wrist_recording(s, setup, seed + i) for i, s in enumerate(performed)]
@@ -141,11 +141,8 @@ def summary(cases: Sequence[dict]) -> dict:
 WORST = ("wrist", "made-up fingers", "poor sensors", "20 Hz, noisy", "500 Hz")  # look: rows of a page
 
 
-def wrist(every: bool = False) -> str | None:
-    """docs/wrist.md: all cases of a kind together, and those that are worst; with `every`, each case."""
-    found = load("wrist")
-    if found is None:
-        return None
+def wrist(found: dict, every: bool = False) -> str:
+    """docs/wrist.md: all cases of a kind together, and the worst ones; with `every`, each case."""
     head = ["", "trials complete", "boundaries, median", "largest", "90 % hold", "weight, rms", "width, rms",
             "height, rms", "95 % hold"]  # fmt: skip
     rows = []

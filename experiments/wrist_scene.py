@@ -1,4 +1,4 @@
-"""Recordings by a gripper with a wrist sensor, made from simulated two-finger trials; truth with them.
+"""Recordings by a gripper with a wrist sensor, made from simulated two-finger trials with their truth.
 
 The hand hangs on the sensor with a tool of known mass, turned about the vertical and tilting a little
 as it goes; the sensor stands askew on it and has an offset. What a lab would record of that.
@@ -28,7 +28,7 @@ TASK = parse_task({
 
 @dataclass(frozen=True)
 class Setup:
-    """How a lab has it: see hmmseg.io.rig for the names."""
+    """A lab's setup; see hmmseg.io.rig for the names."""
 
     mass: float = 0.7
     reaction: bool = False
@@ -52,7 +52,7 @@ def performances(count: int = 2, rate: float = 50.0, seed: int = 0) -> list[Simu
 
 
 def wrist_rig(setup: Setup, **gripper) -> Rig:
-    """The rig that says of the setup what the caller wants said."""
+    """The rig of a setup, with the given entries under [gripper]."""
     said = {"position": ["px", "py", "pz"], "opening": "gap", "wrench": ["Fx", "Fy", "Fz"],
             "closing": "y", "frame": setup.frame} | gripper  # fmt: skip
     if setup.tilt or setup.heading:

@@ -1,8 +1,7 @@
-"""From a task description and a recording to subtasks, block properties and the gap to a simulation.
+"""From a task description and recordings to subtasks, block properties and the gap to a simulation.
 
-`Task`, `Rig` and `Trial` read what is given; `align` and `segment` find the subtasks, `identify` the
-properties, `diagnose` the gap. Packages that begin with an underscore, and names that are not listed here,
-are internal.
+`Task`, `Rig` and `Trial` read the inputs; `align` and `segment` find the subtasks, `identify` the properties,
+`diagnose` the gap. Names that are not listed here are internal.
 """
 
 from hmmseg._lazy import lazily

@@ -1,6 +1,6 @@
 """Packages whose public names are imported on first use, so that importing the packages is quick.
 
-What is public, and where it lives, is said once: in the package's stub, which type checkers and editors read.
+The package's stub, which type checkers and editors read, is the only list of public names and their modules.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from typing import Any
 
 
 def lazily(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """`__getattr__`, `__dir__` and `__all__` of a package, from the imports of the stub next to its `file`.
-
-    A name stays in the package after its first use.
-    """
+    """`__getattr__`, `__dir__` and `__all__` of a package, from the imports of the stub next to its
+    `file`."""
     stub = ast.parse(Path(file).with_suffix(".pyi").read_text(encoding="utf-8"))
     imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
     homes = {alias.name: node.module or "" for node in imports for alias in node.names}
@@ -28,9 +26,9 @@ def lazily(package: str, file: str) -> tuple[Callable[[str], Any], Callable[[], 
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         inside = homes[name] == package  # a module of the package itself
         module = importlib.import_module(f"{package}.{name}" if inside else homes[name])
-        found = module if inside else getattr(module, name)
-        setattr(sys.modules[package], name, found)
-        return found
+        value = module if inside else getattr(module, name)
+        setattr(sys.modules[package], name, value)  # found without `__getattr__` from now on
+        return value
 
     def names() -> list[str]:
         return sorted({*public, *(name for name in vars(sys.modules[package]) if name.startswith("__"))})

@@ -1,4 +1,4 @@
-"""The public functions: they take paths, tables and arrays as well as what was read already."""
+"""The public functions, which take paths, tables and arrays as well as objects that were read before."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Files kept between runs in the user's cache folder: a convenience, without which everything is recomputed.
+"""Files kept between runs in the user's cache folder, without which everything is recomputed.
 
-A file holds a digest, then its content; whatever else is found there (cut short, garbled, of somebody else)
-counts as nothing, is reported once and replaced. Numbers are kept as JSON, never as code.
+A file holds a digest, then its content; anything else (truncated, garbled, foreign) is ignored, reported
+once and replaced. Numbers are kept as JSON, never as code.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class CacheWarning(UserWarning):
 
 
 def cache_folder() -> Path | None:
-    """The user's cache folder of this project, which may be yet to be made; None where there is no home."""
+    """The project's folder in the user's cache, which need not exist yet; None if there is no home."""
     base = os.environ.get("XDG_CACHE_HOME") or ""
-    if os.path.isabs(base):  # others are to be ignored, by the specification of these variables
+    if os.path.isabs(base):  # the XDG specification requires that other values are ignored
         return Path(base) / "hmmseg"
     try:
         return Path.home() / ".cache" / "hmmseg"
@@ -35,7 +35,7 @@ def cache_folder() -> Path | None:
 
 
 def write_whole(path: Path, content: bytes) -> None:
-    """Write a file atomically, so that no reader sees half of it; OSError where it fails."""
+    """Write a file atomically, so that no reader sees part of it; OSError on failure."""
     handle, beside = tempfile.mkstemp(dir=path.parent, prefix=".hmmseg-")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -47,7 +47,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def keep(path: Path | None, content: bytes) -> None:
-    """Keep bytes under a path of the cache; where they cannot be written they are not kept."""
+    """Keep bytes under a path of the cache, if it can be written."""
     if path is None:
         return
     try:
@@ -58,7 +58,7 @@ def keep(path: Path | None, content: bytes) -> None:
 
 
 def kept(path: Path | None) -> bytes | None:
-    """The bytes kept under a path; None where there are none, or not as they were written."""
+    """The bytes kept under a path; None if there are none, or the file is damaged."""
     if path is None:
         return None
     try:
@@ -74,7 +74,7 @@ def kept(path: Path | None) -> bytes | None:
 
 
 def _damaged(path: Path) -> None:
-    """Say so once for a folder, and take the file away."""
+    """Warn once per folder, and remove the file."""
     with contextlib.suppress(OSError):
         path.unlink(missing_ok=True)
     if path.parent not in _said:
@@ -88,7 +88,7 @@ def keep_numbers(path: Path | None, numbers: Sequence[float]) -> None:
 
 
 def kept_numbers(path: Path | None) -> list[float]:
-    """The numbers kept under a path; none where there are none, or not as they were written."""
+    """The numbers kept under a path; empty if there are none, or the file is damaged."""
     content = kept(path)
     if content is None or path is None:
         return []
@@ -96,5 +96,5 @@ def kept_numbers(path: Path | None) -> list[float]:
         found = json.loads(content)
         if isinstance(found, list) and all(isinstance(each, float | int) for each in found):
             return [float(each) for each in found]
-    _damaged(path)  # whole, and yet nothing that this code writes
+    _damaged(path)  # its digest is right, but this code did not write it
     return []

@@ -1,4 +1,5 @@
-"""Log densities of residuals, of arrays as of single numbers: one text, which `hmmseg.online` compiles."""
+"""Log densities of residuals, for arrays and single numbers alike; `hmmseg.online` compiles this source
+too."""
 
 from __future__ import annotations
 
@@ -9,12 +10,12 @@ import numpy as np
 
 from hmmseg.levels import TAIL
 
-EDGE = -25.0  # chosen: nats of an edge at most: one wild sample is a transient, not proof against a state
+EDGE = -25.0  # chosen: nats, least log probability of an edge: one wild sample does not rule out a state
 STUDENT = math.lgamma((TAIL + 1) / 2) - math.lgamma(TAIL / 2) - 0.5 * math.log(TAIL * math.pi)  # physics
 
 
 def log_student(residual: Any, scale: Any) -> Any:
-    """Log density of a Student-t residual; 0 where the residual is missing (NaN)."""
+    """Log density of a Student-t residual; 0 if the residual is missing (NaN)."""
     return np.nan_to_num(STUDENT - np.log(scale) - (TAIL + 1) / 2 * np.log1p((residual / scale) ** 2 / TAIL))
 
 
@@ -27,6 +28,6 @@ def log_student_below(z: Any) -> Any:
 
 
 def log_between(value: Any, low: float, high: float, scale: float) -> Any:
-    """Log density of a uniform on [low, high] with noise-softened edges; 0 where missing."""
+    """Log density of a uniform on [low, high] with edges softened by noise; 0 if missing."""
     soft = log_student_below((value - low) / scale) + log_student_below((high - value) / scale)
     return np.nan_to_num(np.maximum(soft, EDGE) - np.log(high - low))

@@ -1,4 +1,4 @@
-"""The one exception for input at fault; commands print it as one line and exit with 2."""
+"""The exception for invalid input; commands print it as one line and exit with 2."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""JAX settings: double precision, and a compilation cache that persists.
+"""JAX settings: double precision, and a persistent compilation cache.
 
 Importing this project changes no setting of the process. Forces span 1e-3 to 10 N while log-likelihoods
-reach 1e5, so single precision would lose boundaries: public functions run in double precision whatever the
-caller's JAX is set to (`double_precision`). The project's own programs call `configure`, which also keeps
-compiled programs in the user's cache folder, because compilation is a cost the user feels.
+reach 1e5, so that single precision would displace boundaries: public functions run in double precision
+whatever the caller's JAX is set to (`double_precision`). The project's own programs call `configure`, which
+also keeps compiled programs in the user's cache folder, as compilation is slow.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ R = TypeVar("R")
 
 
 class _Programs:
-    """Compiled programs in a folder, as JAX's compilation cache wants it. JAX's own would run what a garbled
-    file holds, and never replaces one that it cannot read."""
+    """Compiled programs in a folder, with the interface of JAX's compilation cache, which itself would run
+    the contents of a garbled file, and never replaces one that it cannot read."""
 
     def __init__(self, folder: str) -> None:
         self._path = Path(folder)
@@ -36,10 +36,10 @@ class _Programs:
 
 
 def configure(steady: bool = False) -> None:
-    """Double precision and the persistent cache for this whole process, JAX imported already or not.
+    """Double precision and the persistent cache for the whole process, before or after JAX is imported.
 
-    `steady`: for a program that calls JAX in a loop with a deadline, before its first computation. JAX then
-    computes in the calling thread; handing over to another one holds up a step in some 250 for 0.3 ms
+    `steady`: for programs that call JAX in a loop with a deadline, before its first computation. JAX then
+    computes in the calling thread, as handing over to another one delays one step in some 250 by 0.3 ms
     (experiments/benchmarks/haptic_loop.py).
     """
     settings: dict[str, Any] = {
@@ -49,7 +49,7 @@ def configure(steady: bool = False) -> None:
     }
     if steady:
         settings["jax_cpu_enable_async_dispatch"] = False
-    for name, value in settings.items():  # what JAX reads when it is imported
+    for name, value in settings.items():  # read by JAX as it is imported
         os.environ[name.upper()] = str(value)
     if "jax" in sys.modules:
         for name, value in settings.items():
@@ -61,8 +61,8 @@ _configured: list[bool] = []
 
 
 def keep_programs() -> None:
-    """Have JAX keep compiled programs in our cache folder where `configure` has been called, once JAX is
-    imported; where its user has a folder for them, they go there."""
+    """Have JAX, once it is imported, keep compiled programs in our cache folder if `configure` was called,
+    unless the user has a folder for them."""
     if _configured:
         _keep_programs()
 
@@ -78,13 +78,13 @@ def _keep_programs() -> None:
         from jax._src import compilation_cache
 
         compilation_cache.get_file_cache = lambda path: (_Programs(path), path)
-    except (ImportError, AttributeError):  # another JAX than those that this was tried with
+    except (ImportError, AttributeError):  # a version of JAX with other internals
         return
     jax.config.update("jax_compilation_cache_dir", str(folder / "programs"))
 
 
 def double_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """The function with JAX in double precision while it runs, and as it was afterwards."""
+    """The function with JAX in double precision while it runs."""
 
     @functools.wraps(function)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:

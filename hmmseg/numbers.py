@@ -1,10 +1,10 @@
-"""Numbers for people: a value with its uncertainty, in one unit for one quantity, without exponents."""
+"""Numbers for readers: a value with its uncertainty, in one unit per quantity, without exponents."""
 
 from __future__ import annotations
 
 import math
 
-# SI unit: factor to what is shown, and its name.
+# By SI unit, the factor to the unit shown, and its name.
 UNITS = {
     "m": (1e3, "mm"),
     "rad": (1e3, "mrad"),
@@ -13,18 +13,18 @@ UNITS = {
     "N s": (1e3, "mN s"),
     "1": (1.0, ""),
 }
-# Property of a block: the same, as the paper shows it.
+# The same by property of a block, as in the paper.
 SHOWN = {"weight": (1.0, "N"), "width": (100.0, "cm"), "height": (100.0, "cm"), "friction": (1.0, "")}
 MOST = 6  # look: decimals shown
 
 
 def shown_as(unit: str, share: bool = False) -> tuple[float, str]:
-    """Factor and name of what an SI unit is shown in; a dimensionless `share` in per cent."""
+    """Factor to the unit in which an SI unit is shown, and its name; a dimensionless `share` in per cent."""
     return (100.0, "%") if share and unit in ("", "1") else UNITS.get(unit, (1.0, unit))
 
 
 def property_shown_as(name: str, unit: str) -> tuple[float, str]:
-    """The same for a property, "block1.width" or "width"; others by their unit."""
+    """The same for a property, "block1.width" or "width"; for others by their unit."""
     return SHOWN.get(name.rpartition(".")[2], shown_as(unit))
 
 
@@ -39,17 +39,17 @@ def plain(value: float, digits: int = 3) -> str:
 
 
 def fixed(value: float, places: int, sign: str = "") -> str:
-    """With so many decimals; what rounds to nothing is 0 and not -0. `sign` "+" shows it of both."""
+    """With this number of decimals, never as -0; `sign` "+" shows the sign of positive numbers too."""
     return f"{0.0 if round(value, places) == 0 else value:{sign}.{places}f}"
 
 
 def _places(error: float) -> int:
-    """Decimals that show two significant digits of an error; none where it is ten or more."""
+    """Decimals that show two significant digits of an error; none if it is ten or more."""
     return min(MOST, max(0, 1 - math.floor(math.log10(error))))
 
 
 def estimate(mean: float, sd: float, shown: tuple[float, str] = (1.0, "")) -> str:
-    """`3985 ± 180 N/m`: two significant digits of the uncertainty, the value to the same place."""
+    """`3985 ± 180 N/m`: two significant digits of the uncertainty, and the value with as many decimals."""
     factor, name = shown
     value, error = mean * factor, abs(sd * factor)
     if not math.isfinite(error) or error == 0 or not math.isfinite(value):
@@ -60,9 +60,9 @@ def estimate(mean: float, sd: float, shown: tuple[float, str] = (1.0, "")) -> st
 
 
 def interval(low: float, high: float, shown: tuple[float, str] = (1.0, ""), sds: float = 3.3) -> str:
-    """`3690 to 4280 N/m`: ends with the decimals of the estimate between them.
+    """`3690 to 4280 N/m`: both ends with the decimals of the estimate between them.
 
-    `sds`: standard deviations from end to end, 3.3 for 90 %.
+    `sds`: standard deviations between the ends, 3.3 for 90 %.
     """
     factor, name = shown
     a, b = low * factor, high * factor
@@ -73,7 +73,7 @@ def interval(low: float, high: float, shown: tuple[float, str] = (1.0, ""), sds:
 
 
 def percent(share: float) -> str:
-    """A share as a whole percentage; what rounds to none or all but is not says so."""
+    """A share as a whole percentage, "under 1 %" or "over 99 %" instead of a rounded 0 or 100."""
     value = 100 * share
     if 0 < value < 0.5:
         return "under 1 %"
@@ -83,7 +83,7 @@ def percent(share: float) -> str:
 
 
 def between(low: float | None, high: float | None) -> str:
-    """An interval of a share, "62 to 78 %"; empty where it is unknown or no wider than is shown."""
+    """An interval of a share, "62 to 78 %"; empty if it is unknown or vanishes in rounding."""
     if low is None or high is None or round(100 * low) == round(100 * high):
         return ""
     return f"{fixed(100 * low, 0)} to {fixed(100 * high, 0)} %"

@@ -1,4 +1,4 @@
-"""Robust statistics, which a few wild samples do not move."""
+"""Robust statistics, insensitive to a few outliers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from math import comb
 
 import numpy as np
 
-NORMAL = 1.4826  # physics: a normal number's standard deviation over its median absolute value
+NORMAL = 1.4826  # physics: ratio of a normal variable's standard deviation to its median absolute value
 
 
 def robust_sd(residual: np.ndarray) -> float:
@@ -15,22 +15,22 @@ def robust_sd(residual: np.ndarray) -> float:
 
 
 def white_sd(values: np.ndarray, order: int = 2) -> float:
-    """Standard deviation of white noise, from differences of some order along the first axis.
+    """Standard deviation of white noise, from differences of this order along the first axis.
 
-    A difference of order k has (2 k choose k) times the noise's variance; its median absolute value is blind
-    to the few samples at which the signal itself bends.
+    A difference of order k has (2 k choose k) times the variance of the noise; the median absolute value
+    ignores the few samples at which the signal itself bends.
     """
     return robust_sd(np.diff(values, order, axis=0)) / np.sqrt(comb(2 * order, order))
 
 
 def runs(found: np.ndarray) -> list[tuple[int, int]]:
-    """Where each stretch of true samples starts and stops."""
+    """Start and stop of each run of true samples."""
     edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(int)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    """The value, of those that are there, at which half of the weight is reached."""
+    """The finite value at which half of the total weight is reached."""
     keep = np.isfinite(values) & (weights > 0)
     order = np.argsort(values[keep])
     cumulative = np.cumsum(weights[keep][order])
@@ -38,7 +38,7 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def median_of_known(values: np.ndarray, otherwise: float = np.nan) -> float:
-    """Median of the values that are there."""
+    """Median of the finite values."""
     there = values[np.isfinite(values)]
     return float(np.median(there)) if there.size else otherwise
 
@@ -46,7 +46,7 @@ def median_of_known(values: np.ndarray, otherwise: float = np.nan) -> float:
 def bridged(values: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:
     """Values (num_samples,) with missing ones interpolated over times `t`, or over samples.
 
-    ValueError where all are missing.
+    ValueError if all are missing.
     """
     there = np.isfinite(values)
     t = np.arange(values.size) if t is None else t

@@ -1,4 +1,4 @@
-"""Results that read like the tables on the terminal: as text, for `repr`, and as HTML, for a notebook."""
+"""Results that show themselves as tables: as text, for `repr`, and as HTML, for notebooks."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-if TYPE_CHECKING:  # rich is loaded when something is shown
+if TYPE_CHECKING:  # rich is imported when something is shown
     from rich.table import Table
 
 WIDTH = 120  # look: characters of a `repr`
 
 
 class Brief:
-    """A dataclass of many arrays whose `repr` is short: it names shapes and types of what is inside."""
+    """A dataclass of many arrays with a short `repr`: shapes and types of its fields."""
 
     def __repr__(self) -> str:
         inside = (f"{f.name}={_brief(getattr(self, f.name))}" for f in fields(self))  # type: ignore[arg-type]
@@ -34,22 +34,22 @@ def _brief(value: Any) -> str:
 
 
 class Tabled(ABC):
-    """A result that shows itself as its `tables`, after its `words` if it has any."""
+    """A result that shows itself as its `words`, if it has any, and its `tables`."""
 
     @abstractmethod
     def tables(self) -> list[Table]:
-        """The tables that are shown."""
+        """The tables to show."""
 
     def words(self) -> str:
-        """What is said before them, a line or nothing."""
+        """A line to show before them, or nothing."""
         return ""
 
     def __repr__(self) -> str:
         return "\n".join([*filter(None, [self.words()]), *map(as_text, self.tables())])
 
     def _repr_html_(self) -> str:
-        said = f"<p>{html.escape(self.words())}</p>" if self.words() else ""
-        return said + "".join(map(as_html, self.tables()))
+        intro = f"<p>{html.escape(self.words())}</p>" if self.words() else ""
+        return intro + "".join(map(as_html, self.tables()))
 
 
 def listed(
@@ -62,11 +62,11 @@ def listed(
     """A table for the terminal.
 
     Args:
-        title: Above it.
-        heads: Of the columns; none, and there is no line of heads.
-        rows: Cells, one for each column.
-        right: Heads of the columns whose cells end on a line.
-        wraps: Whether cells may go on in a further line.
+        title: shown above it.
+        heads: of the columns; without any there is no header row.
+        rows: cells, one per column.
+        right: heads of the columns that are right-aligned.
+        wraps: whether cells may be wrapped.
 
     Returns:
         The table.
@@ -87,7 +87,7 @@ def as_text(table: Table) -> str:
     from rich.console import Console
 
     out = io.StringIO()
-    # In a notebook rich would display the table itself, and leave nothing to return.
+    # In a notebook rich would display the table itself, and return nothing.
     console = Console(file=out, width=WIDTH, color_system=None, force_jupyter=False)
     console.print(table, highlight=False, markup=False)
     return out.getvalue()

@@ -1,7 +1,7 @@
-"""Many recordings, each fitted by itself: in processes of this machine, or on a Dask cluster.
+"""Segment many recordings, each by itself: in processes of this machine, or on a Dask cluster.
 
-What comes of a recording depends on nothing but it, its task and its rig: so neither on how many
-processes there are nor on who is done first.
+The result of a recording depends only on it, its task and its rig, not on the number of processes or their
+order.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.segmentation.spans import Segmentation
 
 LOCAL = "local"
-PATIENCE = 10.0  # limit: s; how long a cluster is waited for
+PATIENCE = 10.0  # limit: s to wait for a cluster
 
 
 @dataclass(frozen=True)
 class Segmented:
-    """What a worker found in one recording."""
+    """Segmentation of one recording, with the warnings and notes of reading it."""
 
     segmentation: Segmentation
     warnings: tuple[str, ...]
@@ -38,9 +38,9 @@ class Segmented:
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """The paths, plain folders replaced by the recordings in them, in the order of their names.
+    """The paths, with plain folders replaced by the recordings in them, in the order of their names.
 
-    A recording in a .txt file has to be named: in a folder it might be notes.
+    Recordings in .txt files must be named: in a folder they might be notes.
     """
     out, kinds = list[Path](), [kind for kind in KINDS if kind != ".txt"]
     for path in paths:
@@ -65,7 +65,7 @@ def _lab(task: Path, rig: Path) -> tuple[BlockTask, Rig]:
 
 
 def segment_one(path: Path, task: Path, rig: Path) -> Segmented:
-    """Segmentation of one recording by itself; runs in a worker."""
+    """Segment one recording by itself; runs in a worker."""
     from hmmseg.hand.read import read_trial
     from hmmseg.segmentation.align import segment
 
@@ -79,11 +79,11 @@ def segment_apart(
     paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
     advance: Callable[[int], None], tell: Callable[[str], None],
 ) -> Iterator[Segmented]:  # fmt: skip
-    """What `segment_one` finds, in the order of the paths; `advance` gets how many more are done.
+    """Results of `segment_one`, in the order of the paths; `advance` gets the number of further ones done.
 
-    A recording whose worker is lost is segmented again by itself; if that worker is lost too it is left out,
-    and `tell` says so. InputError where a recording or the cluster is at fault; what has not begun then is
-    not begun.
+    A recording whose worker is lost is segmented again by itself; if that worker is lost too, it is left out
+    with a warning to `tell`. InputError if a recording or the cluster is at fault; the rest is then
+    cancelled.
     """
     left, lab = list(paths), (task.absolute(), rig.absolute())
     while left:
@@ -102,7 +102,7 @@ def segment_apart(
                         tell(f"{path}: the process that segmented it was killed, twice; it is left out")
                     else:
                         yield replace(found, segmentation=replace(found.segmentation, file=str(path)))
-                    if lost:  # all of a pool is lost with one of its processes; a cluster may be gone
+                    if lost:  # a pool is lost with any of its processes, and a cluster may be gone
                         scheduler = None
                         break
             finally:
@@ -111,7 +111,7 @@ def segment_apart(
 
 
 def _unless_lost(future: Future[Segmented]) -> Segmented | None:
-    """What a worker found; None where it was killed, or its cluster is gone."""
+    """A worker's result; None if the worker was killed or its cluster is gone."""
     try:
         return future.result()
     except (BrokenExecutor, CancelledError):
@@ -124,7 +124,7 @@ def _unless_lost(future: Future[Segmented]) -> Segmented | None:
 
 @contextmanager
 def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
-    """Processes of this machine, or a cluster's workers."""
+    """Processes of this machine, or the workers of a cluster."""
     if scheduler is None:
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers, mp_context=context) as pool:

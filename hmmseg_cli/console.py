@@ -1,8 +1,7 @@
-"""What every command shares: its options, its results on screen and in files, its warnings.
+"""What all commands share: help, input files, results on screen and in files, warnings.
 
-A command opens an `Output` before it reads anything, so that a destination that cannot be
-written is found before the work and not after it. Files are staged apart and put in place
-together by `Output.finish`; a command that fails has written nothing.
+A command opens an `Output` before it reads anything, so that unwritable destinations are reported before the
+work. Files are staged and put in place together by `Output.finish`; a command that fails writes nothing.
 """
 
 from __future__ import annotations
@@ -36,27 +35,27 @@ INPUT_SUFFIXES = (*KINDS, ".toml")
 
 
 class Grouped(TyperCommand):
-    """A command whose help lists its options by what they are for, and ends with examples."""
+    """A command whose help groups its options by purpose and ends with examples."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Options in groups, as their declarations name them."""
+        """Options, in the groups that their declarations name."""
         kinds = {"argument": "Arguments", "option": "Options"}
         rows = ((getattr(p, "rich_help_panel", None) or kinds[p.param_type_name], p.get_help_record(ctx))
                 for p in self.get_params(ctx))  # fmt: skip
         _write_groups(formatter, rows)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Examples, as they are typed."""
+        """Examples, as typed."""
         if self.epilog:
             with formatter.section("Example" if "\n" not in self.epilog else "Examples"):
                 formatter.write("".join(f"  {line}\n" for line in self.epilog.splitlines()))
 
 
 class Hmmseg(TyperGroup):
-    """The command whose help lists its subcommands by what they are for."""
+    """The command whose help groups its subcommands by purpose."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Commands in groups, as `main` names them."""
+        """Commands, in the groups that `main` names."""
         commands: list[Any] = [self.get_command(ctx, name) for name in self.list_commands(ctx)]
         rows = ((c.rich_help_panel, (c.name, c.get_short_help_str(formatter.width))) for c in commands)
         _write_groups(formatter, rows)
@@ -73,11 +72,10 @@ def _write_groups(formatter: Any, rows: Iterable[tuple[str, tuple[str, str] | No
 
 
 class Output:
-    """Where one command's results go: the screen, a JSON document, figures and a report.
+    """Destinations of one command's results: the screen, a JSON document, figures and a report.
 
-    Use as a context manager. `print` and `warn` speak to people, `figure` and `stage` hand out
-    paths to draw and write to, `finish` puts everything in place. Raises InputError at once
-    when a destination cannot be written.
+    A context manager. `print` and `warn` show text, `figure` and `stage` return paths to draw and write to,
+    and `finish` puts everything in place. Raises InputError at once if a destination cannot be written.
     """
 
     def __init__(self, command: str, *, json: str | None = None, figures: Path | None = None,
@@ -111,7 +109,7 @@ class Output:
                 usual(message, category, *where)
 
         warnings.showwarning = show
-        if self.json == STANDARD_OUTPUT:  # a stray print must not spoil the document
+        if self.json == STANDARD_OUTPUT:  # stray prints must not spoil the document
             self._cleanup.enter_context(contextlib.redirect_stdout(sys.stderr))
         return self
 
@@ -119,36 +117,36 @@ class Output:
         self._cleanup.close()
 
     def print(self, *renderables: Any, whole: bool = False) -> None:
-        """Show tables or text to people: standard output, or standard error where `--json -` takes that.
+        """Show tables or text on standard output, or on standard error if `--json -` takes that.
 
-        `whole`: lines are not wrapped, as somebody copies them.
+        `whole`: lines are not wrapped, so that they can be copied.
         """
         for renderable in renderables:
             with self._console.unless_lost():
                 self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
 
     def warn(self, *texts: str) -> None:
-        """Keep warnings for the JSON document and show them on standard error."""
+        """Keep warnings for the JSON document, and show them on standard error."""
         for text in texts:
             self.warnings.append(text)
             with self._side.unless_lost():
                 self._side.print(f"warning: {text}", highlight=False, markup=False, soft_wrap=True)
 
     def write(self, text: str) -> None:
-        """Write to standard output as it is."""
+        """Write text to standard output unchanged."""
         with self._console.unless_lost():
             self._stdout.write(text)
             self._stdout.flush()
 
     @property
     def lost(self) -> str:
-        """Why nobody can be written to any more; empty where all is well."""
+        """Why nothing can be written any more; empty while it can."""
         return self._console.lost
 
     @contextlib.contextmanager
     def progress(self, text: str, total: int) -> Iterator[Callable[..., None]]:
-        """A progress bar on standard error; yields a function that advances it by so many steps, and says
-        what is going on where that is known."""
+        """A progress bar on standard error; yields a function that advances it by some steps and may set its
+        text."""
         from rich.progress import Progress
 
         with Progress(console=self._side, transient=True, disable=not self._side.is_terminal) as bar:
@@ -156,7 +154,7 @@ class Output:
             yield lambda steps, now=text: bar.update(task, advance=steps, description=now)
 
     def figure(self, name: str) -> Path:
-        """Path to draw a figure of this file name to; only where `--figures` was given."""
+        """Path to draw the figure of this file name to; only with `--figures`."""
         if self.figures is None:
             raise ValueError("no folder for figures was given")
         destination = self.figures / name
@@ -165,14 +163,14 @@ class Output:
         return self.stage(destination)
 
     def stage(self, destination: Path) -> Path:
-        """Path to write to now; `finish` puts the file at its destination."""
+        """Path to write to now; `finish` moves the file to its destination."""
         if destination not in self._staged:
-            kind = destination.suffix if len(destination.suffix) < 10 else ""  # names may be as long as any
+            kind = destination.suffix if len(destination.suffix) < 10 else ""  # suffixes may be very long
             self._staged[destination] = self._folder / f"{len(self._staged)}{kind}"
         return self._staged[destination]
 
     def finish(self, document: dict[str, Any]) -> None:
-        """Write the staged files and the JSON document (`format`, `version`, ... are added here)."""
+        """Write the staged files and the JSON document, with `format`, `version`, ... added."""
         envelope = {
             "format": f"hmmseg.{self.command}/1",
             "version": hmmseg.__version__,
@@ -211,10 +209,10 @@ def _plain(value: Any) -> Any:
 
 
 def distinct_trials(paths: Sequence[Path]) -> list[Path]:
-    """The trials' paths, `FILE#NAME` for each recording of a file that holds several.
+    """The trials' paths, `FILE#NAME` for each recording of a file with several.
 
-    InputError where one trial is given twice, under two names even: pooled with itself it would
-    count its noise as independent evidence.
+    InputError if a trial is given twice, even under two names: pooling it with itself would count its noise
+    as independent evidence.
     """
     seen: dict[str, Path] = {}
     out: list[Path] = []
@@ -239,15 +237,15 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-TASK_KEYS = {"objects", "moves", "sequence"}  # without any of which there is no task
-MAPS = {"columns", "topics"}  # keys of a rig that describe how files are read, as `inspect --write` makes it
+TASK_KEYS = {"objects", "moves", "sequence"}  # a task has one of them
+MAPS = {"columns", "topics"}  # keys of a rig that map columns, as `inspect --write` makes it
 NO_HAND = MAPS | {"rate", "gravity"}  # keys that describe no hand
 
 
-def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
+def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
     """Task and rig of these trials: as given, else task.toml and rig.toml in the folder of the first.
 
-    InputError where there is no task, or where each is given as the other.
+    InputError if there is no task, or if one is given as the other.
     """
     folder = split_part(trials[0])[0].parent
     found = [folder / name if given is None and (folder / name).is_file() else given
@@ -256,7 +254,7 @@ def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tu
         raise InputError("--task", "missing", f"the task's description, or a task.toml in {folder}")
     as_task, as_rig = (_keys(path) for path in found)
     if "sequence" in as_task and not (as_rig & MAPS and as_rig <= NO_HAND):
-        found[1] = rig  # needs no hand, and another task's may lie in its folder
+        found[1] = rig  # needs no hand, and a rig in its folder may be another task's
     if as_task and not as_task & TASK_KEYS and (task is not None or as_rig & TASK_KEYS):
         swapped = f"; are --task and --rig {found[1]} swapped?" if as_rig & TASK_KEYS else ""
         raise InputError(
@@ -267,8 +265,8 @@ def described(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tu
     return found[0], found[1]
 
 
-def needed(rig: Path | None, trials: Sequence[Path]) -> Path:
-    """The rig of a task of blocks; InputError where there is none."""
+def require_rig(rig: Path | None, trials: Sequence[Path]) -> Path:
+    """The rig of a task of blocks; InputError if there is none."""
     if rig is None:
         folder = split_part(trials[0])[0].parent
         raise InputError(
@@ -278,7 +276,7 @@ def needed(rig: Path | None, trials: Sequence[Path]) -> Path:
 
 
 def _keys(path: Path | None) -> set[str]:
-    """Keys at the top of a TOML file; none where it cannot be read, which its reader reports."""
+    """Top-level keys of a TOML file; none if it cannot be read, which its reader reports."""
     try:
         return set() if path is None else set(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError):
@@ -286,7 +284,7 @@ def _keys(path: Path | None) -> set[str]:
 
 
 def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any = None) -> list[Any]:
-    """The trials of a command; what is unlikely about them is warned of."""
+    """Read the trials of a command, with warnings about what is unlikely."""
     from hmmseg.hand.read import read_trial
 
     found = [read_trial(path, rig, task) for path in paths]
@@ -302,7 +300,7 @@ def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any =
 
 @contextlib.contextmanager
 def named(where: str) -> Iterator[None]:
-    """Within it what the system refuses (a name too long, a disk that is gone) is an InputError."""
+    """Turn refusals of the system (a name too long, a disk that is gone) into InputErrors."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -310,7 +308,7 @@ def named(where: str) -> Iterator[None]:
 
 
 def check_folder(option: str, folder: Path) -> None:
-    """InputError unless files can be written into the folder, which may be yet to be made."""
+    """InputError unless files can be written into the folder, which need not exist yet."""
     existing = folder.absolute()
     with named(f"{option} {folder}"):
         while not existing.exists():
@@ -322,13 +320,13 @@ def check_folder(option: str, folder: Path) -> None:
 
 
 def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: Sequence[str] = ()) -> None:
-    """InputError unless this file can be written; `suffixes` are its kinds, `refused` what it may not be."""
+    """InputError unless this file can be written; `suffixes` are allowed, `refused` are not."""
     where = f"{option} {path}"
     with named(where), contextlib.suppress(FileNotFoundError, NotADirectoryError):
         path.lstat()
     if suffixes and path.suffix.lower() not in suffixes:
         raise InputError(where, "unknown kind of file", " or ".join(suffixes))
-    if path.suffix.lower() in refused:  # `--json TRIAL.csv`, its own operand forgotten
+    if path.suffix.lower() in refused:  # `--json TRIAL.csv`, with its own argument forgotten
         raise InputError(where, "would be written over, and its name is that of an input", "a .json file")
     if path.is_dir():
         raise InputError(where, "is a folder", "a file")
@@ -339,12 +337,12 @@ def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: S
 
 
 def _publish(staged: dict[Path, Path]) -> None:
-    """Copy next to each destination first, then rename: nobody sees half a file, nor a copy after Ctrl-C."""
+    """Copy next to each destination first, then rename, so that no partial file is ever visible."""
     temporaries: dict[Path, Path] = {}
     destination = Path()
     try:
         for destination, source in staged.items():
-            if destination.exists() and not destination.is_file():  # a pipe or device: no renaming onto it
+            if destination.exists() and not destination.is_file():  # pipes and devices cannot be renamed onto
                 destination.write_bytes(source.read_bytes())
                 continue
             target = destination.resolve()
@@ -361,7 +359,7 @@ def _publish(staged: dict[Path, Path]) -> None:
 
 
 def _put(temporaries: dict[Path, Path]) -> None:
-    """Rename all. Interrupted in between, the rest first; refused, all is as it was before."""
+    """Rename all. If interrupted in between, the rest is renamed first; if refused, all is restored."""
     interrupted: KeyboardInterrupt | None = None
     before = {target: temporary.with_suffix(".old") for target, temporary in temporaries.items()}
     try:
@@ -392,7 +390,7 @@ def _put(temporaries: dict[Path, Path]) -> None:
 
 @contextlib.contextmanager
 def scratch() -> Iterator[Path]:
-    """A folder of temporary files for this run."""
+    """A folder for temporary files of this run."""
     try:
         folder = tempfile.TemporaryDirectory(prefix="hmmseg_", ignore_cleanup_errors=True)
     except OSError as error:
@@ -403,11 +401,11 @@ def scratch() -> Iterator[Path]:
 
 
 class _Screen(Console):
-    """A console that shows no control characters of what it is given, and that may lose its reader."""
+    """A console that escapes control characters, and that may lose its reader."""
 
     lost: str = ""  # why nothing can be written any more
 
-    def on_broken_pipe(self) -> None:  # rich's own ends the process
+    def on_broken_pipe(self) -> None:  # rich itself would end the process
         raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
     def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
@@ -415,11 +413,11 @@ class _Screen(Console):
             if segment.control:
                 yield segment
             else:
-                yield Segment(visible(segment.text), segment.style)
+                yield Segment(escape_control(segment.text), segment.style)
 
     @contextlib.contextmanager
     def unless_lost(self) -> Iterator[None]:
-        """Within it a reader that has gone, or a disk that is full, is noted, and nothing more is written."""
+        """After a reader is gone, or a disk is full, write nothing more."""
         try:
             yield
         except OSError as error:
@@ -429,7 +427,7 @@ class _Screen(Console):
 
 
 def discard(stream: Any) -> None:
-    """Let what is still in a stream's buffer go nowhere: it would be complained of when the process ends."""
+    """Drop what is left in a stream's buffer, about which Python would complain at exit."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
@@ -439,11 +437,11 @@ def discard(stream: Any) -> None:
 CONTROL = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
 
 
-def visible(text: str) -> str:
-    """The text with control characters, escapes among them, as \\x1b: names of files may hold any."""
+def escape_control(text: str) -> str:
+    """The text with control characters as \\x1b: file names may contain any."""
     return text.translate(CONTROL)
 
 
 def _console(file: Any, quiet: bool) -> _Screen:
-    width = None if file.isatty() or "COLUMNS" in os.environ else 120  # rich would fold a pipe at 80
+    width = None if file.isatty() or "COLUMNS" in os.environ else 120  # rich would wrap pipes at 80
     return _Screen(file=file, quiet=quiet, width=width)

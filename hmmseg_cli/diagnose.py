@@ -12,8 +12,16 @@ from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, SequenceTask, read_task
 from hmmseg.numbers import percent
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Grouped, Output, check_folder, described, distinct_trials, needed, read_trials
-from hmmseg_cli.diagnose_robot import OwnSimulator, compare_robot, diagnose_robot
+from hmmseg_cli.console import (
+    Grouped,
+    Output,
+    check_folder,
+    distinct_trials,
+    find_inputs,
+    read_trials,
+    require_rig,
+)
+from hmmseg_cli.robot import OwnSimulator, compare_robot, diagnose_robot
 from simgap.report.finding import plain_name, sentence, settles, tables
 
 if TYPE_CHECKING:
@@ -30,10 +38,10 @@ LISTS = ("--against", "--healthy")  # options that take several files
 
 
 class Diagnose(Grouped):
-    """The command, whose `--against A B` stands for `--against A --against B`; so does `--healthy`."""
+    """The command, in which `--against A B` stands for `--against A --against B`; so does `--healthy`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Every file after such an option gets an option of its own, as the parser wants it."""
+        """Repeat the option before every further file, as the parser expects it."""
         out: list[str] = []
         taking = ""
         for arg in args:
@@ -60,7 +68,7 @@ def diagnose(
     with Output("diagnose", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         paths = distinct_trials(trials)
         if model is not None and mjcf is None and model.suffix.lower() != ".npz":
-            model, mjcf = None, model  # a robot's, not the emissions of a task
+            model, mjcf = None, model  # a robot's model, not a task's emissions
         own = OwnSimulator(simulator, mjcf, map_file, candidate or [], patch, history, rerun)
         if own.given:
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
@@ -70,7 +78,7 @@ def diagnose(
             else:
                 diagnose_robot(out, paths, own, task, effect or [])
             return
-        task, rig = described(paths, task, rig)
+        task, rig = find_inputs(paths, task, rig)
         description = read_task(task)
         if against:
             refuse("does not go with --against", {"--patch": patch, "--healthy": healthy, "--actual": actual})
@@ -79,7 +87,7 @@ def diagnose(
         if not isinstance(description, BlockTask):
             raise InputError(str(task), "a plain ordered task has no virtual model", "--against SIM")
         refuse("goes only with a plain ordered task", {"--model": model})
-        rig = needed(rig, paths)
+        rig = require_rig(rig, paths)
         hand = read_rig(rig)
         if patch is not None:
             check_folder("--patch", patch)
@@ -93,15 +101,15 @@ diagnose.cls = Diagnose  # type: ignore[attr-defined]
 
 
 def refuse(problem: str, given: dict[str, Any]) -> None:
-    """InputError for the first option that was given."""
+    """InputError for the first option given."""
     for option, value in given.items():
         if value:
             raise InputError(option, problem)
 
 
 def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:
-    """Write the corrected model; a warning where there is no cause to correct, or where it leaves as much of
-    trials that took no part."""
+    """Write the corrected model; only a warning if there is no cause to correct, or if correcting it does not
+    reduce the gap of held-out trials."""
     from simgap.patch import files
 
     if (folder / "rig.toml").resolve() == rig.resolve():
@@ -110,13 +118,13 @@ def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:
     if not written:
         out.warn(f"--patch {folder}: no cause was named, so there is nothing to correct; nothing is written")
         return
-    gone = (found.body["shrinkage"] or {}).get("fraction")
-    if gone is not None and gone <= 0:
+    fraction = (found.body["shrinkage"] or {}).get("fraction")
+    if fraction is not None and fraction <= 0:
         out.warn(f"--patch {folder}: the cause takes nothing off held-out trials; nothing is written")
         return
     for name, text in written.items():
         out.stage(folder / name).write_text(text, encoding="utf-8")
-    share = "" if gone is None else f"; with it the gap shrinks by {percent(gone)} on held-out trials"
+    share = "" if fraction is None else f"; with it the gap shrinks by {percent(fraction)} on held-out trials"
     out.print(
         f"{' and '.join(map(plain_name, found.body['causes']))}: put into {folder / 'rig.toml'}{share}. "
         f"hmmseg simulate takes it with --rig, and the ranges for training are in ranges.json"
@@ -127,7 +135,7 @@ def run(
     out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig, actual: Path | None, effect: Sequence[str],
     healthy: Sequence[Path] = (),
 ) -> Diagnosis:  # fmt: skip
-    """Diagnose, and put table, figures and page where `out` has them go."""
+    """Diagnose, and write table, figures and page to the destinations of `out`."""
     from estimation.report import read_actual
     from hmmseg.segmentation.align import align
     from simgap.effects import catalogue
@@ -136,9 +144,9 @@ def run(
 
     measured = None if actual is None else read_actual(actual, task.objects)
     recordings = read_trials(out, paths, rig)
-    well = read_trials(out, distinct_trials(healthy), rig)
+    healthy_trials = read_trials(out, distinct_trials(healthy), rig)
     with out.progress("diagnosing", total=STAGES) as advance:
-        null = align(well, task, rig) if well else None
+        null = align(healthy_trials, task, rig) if healthy_trials else None
         aligned = align(recordings, task, rig)
         found = find(aligned, measured, effect, out.seed, lambda _: advance(1), healthy=null)
     pads = rig.fingertip.model_dump()
@@ -153,7 +161,7 @@ def _against(
     out: Output, paths: Sequence[Path], against: Sequence[Path], task: BlockTask | SequenceTask,
     rig_file: Path | None, effect: Sequence[str], model_file: Path | None,
 ) -> None:  # fmt: skip
-    """The generic diagnosis, against given simulated trials."""
+    """Diagnose the gap to given simulated trials."""
     from hmmseg.sequence.model import load_model
     from simgap.generic.diagnose import diagnose as compare
     from simgap.generic.effects import effects
@@ -162,7 +170,7 @@ def _against(
     hand, every, count = None, distinct_trials([*paths, *against]), len(paths)
     if isinstance(task, BlockTask):
         refuse("goes only with a plain ordered task", {"--model": model_file})
-        hand = read_rig(needed(rig_file, paths))
+        hand = read_rig(require_rig(rig_file, paths))
     read = read_trials(out, every, hand, None if isinstance(task, BlockTask) else task)
     with out.progress("diagnosing", total=3) as advance:
         if isinstance(task, BlockTask):
@@ -183,7 +191,7 @@ def _draw(
     out: Output, found: Diagnosis | GenericDiagnosis, files: Sequence[str], task: BlockTask | SequenceTask,
     candidates: Mapping[str, Effect], pads: Mapping[str, float] | None = None, measured: Actual | None = None,
 ) -> None:  # fmt: skip
-    """Figures and page where wanted; `pads` of a diagnosis against the virtual model, which has them."""
+    """Draw figures and page if wanted; `pads` only against the virtual model, which has them."""
     if out.figures is None and out.report is None:
         return
     from hmmseg.contact.decompose import subtasks

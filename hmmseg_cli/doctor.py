@@ -1,4 +1,4 @@
-"""`hmmseg doctor`: what is installed and where, for a report of a fault."""
+"""`hmmseg doctor`: versions and folders of the installation, for bug reports."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def doctor(json: opt.Json = None, quiet: opt.Quiet = False) -> None:
 
 
 def examined() -> dict[str, Any]:
-    """What a report of a fault needs, by name; None for what is not there."""
+    """Contents of a bug report, by name; None for what is not installed."""
     import jax
 
     from hmmseg.cache import cache_folder
@@ -48,7 +48,7 @@ def examined() -> dict[str, Any]:
 
 
 def _state(path: Any) -> str:
-    """Whether a folder is there and can be written to, and how much is in it."""
+    """Whether a folder exists and can be written to, and how many files it holds."""
     if not os.path.isdir(path):
         return "not there"
     count = sum(len(files) for _, _, files in os.walk(path))
@@ -56,7 +56,7 @@ def _state(path: Any) -> str:
 
 
 def _versions() -> dict[str, str | None]:
-    """Each package that is required, or that an extra brings, with its version."""
+    """Version of each required or optional package."""
     names = {}
     for wanted in importlib.metadata.requires("hmmseg") or ():
         name, _, extra = wanted.partition(";")

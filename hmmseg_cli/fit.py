@@ -1,7 +1,7 @@
 """`hmmseg fit`: learn the emissions and durations of a plain ordered task from trials.
 
-`--labels`, what is known of some boundaries of some trials, is a folder with NAME.json for trials,
-{"boundaries": [times in s, null where unknown]}, or a CSV file with the columns trial, subtask and start [s].
+`--labels` gives known boundaries: a folder with NAME.json for some trials, {"boundaries": [times in s, null
+where unknown]}, or a CSV file with the columns trial, subtask and start [s].
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import SequenceTask, read_task
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Output, check_file, described, distinct_trials, read_trials
+from hmmseg_cli.console import Output, check_file, distinct_trials, find_inputs, read_trials
 
 
 def fit(
@@ -26,7 +26,7 @@ def fit(
     with Output("fit", json=json, seed=seed, quiet=quiet) as out:
         check_file("--model", model, suffixes=(".npz",))
         paths = distinct_trials(trials)
-        task, rig = described(paths, task, rig)
+        task, rig = find_inputs(paths, task, rig)
         description = read_task(task)
         if not isinstance(description, SequenceTask):
             raise InputError(str(task), "a task of blocks needs no fitting: its emissions are physics",
@@ -56,17 +56,17 @@ COLUMNS = ("trial", "subtask", "start")
 
 
 def read_labels_given(where: Path, names: list[str]) -> dict[str, Any]:
-    """Labels of trials.
+    """Read labels of trials.
 
     Args:
-        where: A folder with NAME.json, or a CSV file.
-        names: Of the trials.
+        where: a folder with NAME.json, or a CSV file.
+        names: of the trials.
 
     Returns:
-        By a trial's name its labels, as `hmmseg.sequence.fit` takes them; trials without any are left out.
+        Labels as `hmmseg.sequence.fit` takes them, by trial; unlabelled trials are left out.
 
     Raises:
-        InputError: There are no labels, they cannot be read, or are of none of the trials.
+        InputError: there are no labels, they cannot be read, or belong to none of the trials.
     """
     stems = {Path(name).stem: name for name in names}
     if where.is_dir():

@@ -10,7 +10,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Output, described, distinct_trials, needed, read_trials
+from hmmseg_cli.console import Output, distinct_trials, find_inputs, read_trials, require_rig
 from hmmseg_cli.options import Estimator
 from hmmseg_cli.segment import warn_of_misfits
 
@@ -27,14 +27,14 @@ def identify(
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
-        found, hand = described(trials, task, rig)
-        out.finish(run(out, trials, found, needed(hand, trials), method, actual))
+        found, hand = find_inputs(trials, task, rig)
+        out.finish(run(out, trials, found, require_rig(hand, trials), method, actual))
 
 
 def run(
     out: Output, trials: Sequence[Path], task: Path, rig: Path, method: Estimator, actual: Path | None
 ) -> dict[str, Any]:
-    """Identify, put table, figures and page where `out` has them go, and give the document."""
+    """Identify, write table, figures and page to the destinations of `out`, and return the document."""
     paths = distinct_trials(trials)
     description = read_task(task)
     if not isinstance(description, BlockTask):
@@ -76,7 +76,7 @@ def run(
 def _paper(
     out: Output, recordings: Sequence[Trial], task: BlockTask, hand: Rig
 ) -> tuple[dict[str, Any], list[Segmentation]]:
-    """The paper's thresholds and formulas: the document's body, and the segmentations."""
+    """The paper's thresholds and formulas: body of the document, and segmentations."""
     from estimation.paper_formulas import estimate_plugin
     from hmmseg.hand.signals import task_space
     from hmmseg.segmentation.thresholds import segment_qualitative

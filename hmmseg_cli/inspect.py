@@ -1,4 +1,4 @@
-"""`hmmseg inspect`: what is in a recording, and the mapping that would read it."""
+"""`hmmseg inspect` and `hmmseg new`: what is in a recording, and the files that would read it."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any
 from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.io.schema import parse_toml
+from hmmseg.io.task import read_task
 from hmmseg.tables import listed
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Output, check_file
+from hmmseg_cli.console import Output, check_file, check_folder
+from hmmseg_cli.options import Hand
 
 if TYPE_CHECKING:
     from hmmseg.hand.inspect import Inspection
 
 BARS = "▁▂▃▄▅▆▇█"
-# Names that `hmmseg new` gives a gripper's columns until somebody says which they are.
-LAID_OUT = {"x", "y", "z", "opening", "fx", "fy", "fz", "tx", "ty", "tz"}
+# Names of a gripper's columns in the template of `hmmseg new`, before they are filled in.
+TEMPLATE_NAMES = {"x", "y", "z", "opening", "fx", "fy", "fz", "tx", "ty", "tz"}
 
 
 def inspect(
@@ -41,7 +43,7 @@ def inspect(
 
 
 def extended(rig_file: Path, found: Sequence[Inspection]) -> str:
-    """The rig's text with the mapping added; InputError where there is one, or none to add."""
+    """The rig's text with the mapping added; InputError if it has one already, or none was found."""
     proposed = list(dict.fromkeys(each.toml for each in found if each.toml))
     if not proposed:
         raise InputError(
@@ -51,13 +53,13 @@ def extended(rig_file: Path, found: Sequence[Inspection]) -> str:
         raise InputError(f"--write {rig_file}", "the files need different mappings", "one at a time")
     text = rig_file.read_text(encoding="utf-8") if rig_file.exists() else ""
     now = parse_rig(parse_toml(text, str(rig_file)), str(rig_file))
-    laid_out = now.gripper is not None and set(now.gripper.channels) <= LAID_OUT
+    unfilled = now.gripper is not None and set(now.gripper.channels) <= TEMPLATE_NAMES
     import tomlkit
 
     document = tomlkit.parse(text)
     for name, table in tomlkit.parse(proposed[0]).items():
         there = document.get(name)
-        if there and not (name == "gripper" and laid_out):
+        if there and not (name == "gripper" and unfilled):
             raise InputError(f"--write {rig_file}", f"already has [{name}]", "a rig without it")
         if there is None:
             document.add(tomlkit.nl())
@@ -84,18 +86,18 @@ def _show(out: Output, found: Inspection) -> None:
          _number(c.minimum), _number(c.maximum), sparkline(c.course)) for c in found.channels
     ]  # fmt: skip
     out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
-    out.warn(*found.said)
-    then = f"hmmseg segment {found.file} --task task.toml"
+    out.warn(*found.remarks)
+    segment = f"hmmseg segment {found.file} --task task.toml"
     if found.toml:
         out.print("proposed for rig.toml:")
-        said = f"{found.toml}\nnext: hmmseg inspect {found.file} --write rig.toml, or copy it there"
+        text = f"{found.toml}\nnext: hmmseg inspect {found.file} --write rig.toml, or copy it there"
     elif not found.understood:
-        said = (f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
+        text = (f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
                 "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"
-                f'sequence = ["...", "..."] in task.toml, then: {then}')  # fmt: skip
+                f'sequence = ["...", "..."] in task.toml, then: {segment}')  # fmt: skip
     else:
-        said = f"{found.file}: all columns understood; next: {then} --rig rig.toml"
-    out.print(said, whole=True)
+        text = f"{found.file}: all columns understood; next: {segment} --rig rig.toml"
+    out.print(text, whole=True)
 
 
 def _number(value: float | None) -> str:
@@ -103,11 +105,11 @@ def _number(value: float | None) -> str:
 
 
 def sparkline(course: tuple[float, ...]) -> str:
-    """A course in bars, a blank where nothing is."""
+    """A course as bars, blank where it is missing."""
     there = [value for value in course if value == value]
     if not there:
         return ""
-    low, high = min(there) / 8, max(there) / 8  # the difference of two numbers may be beyond all of them
+    low, high = min(there) / 8, max(there) / 8  # the difference of the values themselves may overflow
     steps = [int(8 * (v / 8 - low) / (high - low)) if v == v and high > low else 0 for v in course]
     return "".join(" " if v != v else BARS[min(7, k)] for v, k in zip(course, steps, strict=True))
 
@@ -119,5 +121,67 @@ def _document(found: Inspection) -> dict[str, Any]:
         "end": found.end, "rate": found.rate, "origin_ns": found.origin,
         "gaps": [{"start": start, "end": end} for start, end in found.gaps],
         "channels": [{name: getattr(c, name) for name in names} for c in found.channels],
-        "mapping": found.mapping, "toml": found.toml or None, "findings": found.said,
+        "mapping": found.mapping, "toml": found.toml or None, "findings": found.remarks,
     }  # fmt: skip
+
+
+def new(
+    folder: opt.Folder, hand: opt.HandKind = None, source: opt.Source = None, mjcf: opt.LaidOutModel = None,
+    json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """A commented rig.toml and task.toml, filled in from a recording or to fill in; or a robot's map.toml."""
+    from jinja2 import Environment, PackageLoader
+
+    with Output("new", json=json, seed=seed, quiet=quiet) as out:
+        check_folder("FOLDER", folder)
+        targets = [folder / name for name in (("rig.toml", "task.toml") if mjcf is None else ("map.toml",))]
+        if mjcf is not None and source is None:
+            raise InputError("--mjcf", "needs a log", "--from LOG")
+        from hmmseg.hand.inspect import inspect as look
+
+        looked = None if source is None else look(source)
+        for path in targets:
+            if path.exists():
+                raise InputError(str(path), "is there already and would be written over", "another folder")
+        if mjcf is not None:
+            assert looked is not None and source is not None
+            _lay_out_map(out, targets[0], mjcf, source, looked)
+            out.finish({"files": [str(targets[0])], "hand": None})
+            return
+        hand, rate = (hand or Hand.CARTESIAN, 50.0) if looked is None else _seen(hand, looked)
+        pages = Environment(loader=PackageLoader("hmmseg_cli"), keep_trailing_newline=True, autoescape=False)
+        for path, read in zip(targets, (read_rig, read_task), strict=True):
+            staged = out.stage(path)
+            text = pages.get_template(f"{path.name}.j2").render(hand=hand.value, rate=rate)
+            staged.write_text(text, encoding="utf-8")
+            if looked is not None and looked.toml and path == targets[0]:
+                staged.write_text(extended(staged, [looked]), encoding="utf-8")
+            read(staged)
+        then = "hmmseg inspect FILE looks into a recording"
+        if looked is not None:
+            then = ("say in task.toml what goes where, then: "
+                    f"hmmseg segment {source} --task {targets[1]} --rig {targets[0]}")  # fmt: skip
+        out.print(f"wrote {targets[0]} and {targets[1]}; {then}")
+        out.finish({"files": [str(path) for path in targets], "hand": hand.value})
+
+
+def _seen(hand: Hand | None, looked: Inspection) -> tuple[Hand, float]:
+    """The hand and its sampling rate [Hz], from a recording."""
+    names = {channel.name for channel in looked.channels} | set(looked.mapping or ())
+    if hand is None and "[gripper]" in looked.toml:
+        hand = Hand.GRIPPER
+    if hand is None:
+        kinds = {Hand.JOINTED: {"q11", "q21"}, Hand.CARTESIAN: {"x1", "x2"}}
+        hand = next((kind for kind, needed in kinds.items() if needed <= names), Hand.NONE)
+    return hand, float(f"{looked.rate or 50.0:.4g}")
+
+
+def _lay_out_map(out: Output, path: Path, mjcf: Path, source: Path, looked: Inspection) -> None:
+    """Write a map.toml that matches columns of a log with parts of the model by name."""
+    from simgap.simulators.mjcf.map import proposed_map
+
+    text, open_columns = proposed_map(mjcf, [(c.name, c.unit) for c in looked.channels if not c.text])
+    out.stage(path).write_text(text, encoding="utf-8")
+    left = f"; columns left to you: {', '.join(open_columns)}" if open_columns else ""
+    out.print(f"wrote {path}{left}")
+    out.print(f"then: hmmseg diagnose {source} --mjcf {mjcf} --map {path} --report gap.html")

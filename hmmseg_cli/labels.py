@@ -1,9 +1,9 @@
-"""`--write` of `hmmseg segment`: recordings written back with their segmentation, for training and viewers.
+"""`hmmseg segment --write`: copies of recordings with their segmentation, for training and viewers.
 
-Tables (CSV, Parquet) get columns: `subtask_index` (from 0), `subtask`, `object`, `state`, and
-`boundary_sd`, the standard deviation [s] of the nearer boundary of the sample's span. An MCAP
-gets the topic `/hmmseg/subtask`, one JSON message a boundary. A LeRobot data set gets rows of style
-`subtask` in its `language_persistent`, as its own tools have them, and the feature `boundary_sd`.
+Tables (CSV, Parquet) get the columns `subtask_index` (from 0), `subtask`, `object`, `state`, and
+`boundary_sd`, the standard deviation [s] of the nearer boundary of the sample's span. An MCAP gets the topic
+`/hmmseg/subtask`, with one JSON message per boundary. A LeRobot data set gets rows of style `subtask` in
+`language_persistent`, as its own tools write them, and the feature `boundary_sd`.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def write_labels(
 
 
 def _targets(write: Path, paths: Sequence[Path]) -> list[Path]:
-    """One file a recording: the one given, or in the folder under the recording's own name."""
+    """One file per recording: the one given, or in the folder under the recording's own name."""
     if write.suffix.lower() in KINDS:
         return [write]
     out = []
@@ -86,20 +86,20 @@ ADDED = ("subtask_index", "subtask", "object", "state", "boundary_sd")
 
 @dataclass(frozen=True)
 class Labels:
-    """Of every sample (num_timesteps,): index of its span (-1 outside all), and boundary sd [s]."""
+    """Index of the span of each sample (num_timesteps,), -1 outside all, and its boundary sd [s]."""
 
     index: np.ndarray
     boundary_sd: np.ndarray
     spans: tuple[Span, ...]
 
     def names(self, field: str) -> np.ndarray:
-        """A field of each sample's span, empty where it has none."""
+        """A field of each sample's span, empty outside all."""
         entries = [getattr(span, field) or "" for span in self.spans]
         return np.array([*entries, ""], dtype=object)[self.index]
 
 
 def label(t: np.ndarray, spans: Sequence[Span]) -> Labels:
-    """Labels of samples at t (num_timesteps,) [s]; spans are half-open, the last keeps its end."""
+    """Labels of samples at t (num_timesteps,) [s]; spans are half-open, except for the end of the last."""
     if not spans:
         return Labels(np.full(t.size, -1), np.full(t.size, np.nan), ())
     starts, ends, start_sd, end_sd = np.array([(s.start, s.end, s.start_sd, s.end_sd) for s in spans]).T
@@ -111,7 +111,7 @@ def label(t: np.ndarray, spans: Sequence[Span]) -> Labels:
 
 
 def write_table(path: Path, source: str | Path, trial: Trial, spans: Sequence[Span]) -> None:
-    """The source's own columns with the labels added, as CSV or Parquet by the path's ending."""
+    """Write the source's columns with the labels added, as CSV or Parquet by the path's suffix."""
     table, labels = read_table(source), label(trial.t, spans)
     for name in ADDED:
         if name in table.names:
@@ -131,7 +131,7 @@ FIELDS = {
 
 
 def write_mcap(path: Path, source: str | Path, trial: Trial, spans: Sequence[Span]) -> None:
-    """A new MCAP with the topic of subtasks, and all messages of the source if it is one."""
+    """Write an MCAP with the topic of subtasks, and all messages of the source if it is an MCAP."""
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
@@ -149,9 +149,9 @@ def write_mcap(path: Path, source: str | Path, trial: Trial, spans: Sequence[Spa
         for number, span in enumerate(spans):
             body = {name: getattr(span, name, None) or "" for name in ("subtask", "object", "state")}
             times = {name: getattr(span, name) for name in ("start", "end", "start_sd", "end_sd")}
-            said = json.dumps({"subtask_index": number} | body | times)
+            entry = json.dumps({"subtask_index": number} | body | times)
             when = origin + round(span.start * 1e9)
-            writer.add_message(channel, when, said.encode(), when, number)
+            writer.add_message(channel, when, entry.encode(), when, number)
         writer.finish()
 
 
@@ -171,9 +171,9 @@ def _copy(reader: Any, writer: Any) -> None:
 def lerobot_files(
     folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]]
 ) -> dict[Path, Callable[[Path], object]]:
-    """Files of an annotated copy by their place below its folder, each a function that writes it to a path.
+    """Files of an annotated copy by their place in its folder, each with a function that writes it to a path.
 
-    Episodes that are not labelled have no subtasks. Videos are not copied.
+    Episodes without labels get no subtasks. Videos are not copied.
     """
     from hmmseg.io.formats.lerobot import EVENTS, PERSISTENT, data_files, read_info, read_subtasks
 

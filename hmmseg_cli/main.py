@@ -1,7 +1,7 @@
 """The `hmmseg` command and its exit codes.
 
-0: done, whatever was found. 2: the input is at fault; one line on standard error says where.
-Any other exception is a bug and shows its traceback; what the machine refuses (memory, a disk) is not.
+0: done, whatever was found. 2: the input is at fault, as one line on standard error says, or the machine
+refuses (memory, a disk). Any other exception is a bug and shows its traceback.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ import _thread
 import contextlib
 import gc
 import os
+import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -21,24 +22,22 @@ import hmmseg
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import configure
 from hmmseg_cli import (
-    calibrate,
-    decompose,
     demo,
+    describe,
     diagnose,
     doctor,
-    effects,
     fit,
     identify,
     inspect,
-    new,
     play,
+    robot,
     segment,
     simulate,
     watch,
 )
-from hmmseg_cli.console import Grouped, Hmmseg, discard, visible
+from hmmseg_cli.console import Grouped, Hmmseg, discard, escape_control
 
-# numerics: objects between two garbage collections: most are modules' and compilers', which stay anyway
+# numerics: objects between two garbage collections: most belong to modules and compilers, and stay anyway
 COLLECTED = 10_000
 
 # `typer` no longer exposes (nor, since it carries its own copy, depends on) click's base class.
@@ -52,9 +51,9 @@ app = typer.Typer(cls=Hmmseg, rich_markup_mode=None, context_settings={"help_opt
 COMMANDS = {
     "Begin": {
         demo.demo: "hmmseg demo",
-        new.new: "hmmseg new my_hand --from trial_01.csv",
+        inspect.new: "hmmseg new my_hand --from trial_01.csv",
         inspect.inspect: "hmmseg inspect trial_01.csv",
-        decompose.decompose: "hmmseg decompose task.toml",
+        describe.decompose: "hmmseg decompose task.toml",
         doctor.doctor: "hmmseg doctor",
     },
     "When and what": {
@@ -64,9 +63,9 @@ COMMANDS = {
         fit.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
     },
     "Why simulation and recording differ": {
-        calibrate.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",
+        robot.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",
         diagnose.diagnose: diagnose.EXAMPLES,
-        effects.effects: "hmmseg effects",
+        describe.effects: "hmmseg effects",
     },
     "The virtual blocks": {
         simulate.simulate: "hmmseg simulate --task task.toml --rig rig.toml --properties result.json",
@@ -98,14 +97,14 @@ def _hmmseg(
     """Identify an object's weight, width, height and friction from what a robot hand felt."""
 
 
-AGAIN = 0.02  # numerics: s; the callback has returned by then, and if not it is sent once more
+AGAIN = 0.02  # numerics: s until an interrupt is repeated; the callback has usually returned by then
 
 
 @contextlib.contextmanager
-def heard() -> Iterator[None]:
-    """Within it no interrupt is lost, or reported with a traceback.
+def repeat_interrupts() -> Iterator[None]:
+    """Lose no interrupt, and report none with a traceback.
 
-    A Ctrl-C that comes while a compiler calls back into Python is dropped there, and sent again here.
+    A Ctrl-C that arrives while a compiler calls back into Python is dropped there, and repeated here.
     """
     usual, waiting = sys.unraisablehook, []
 
@@ -133,7 +132,7 @@ def main(args: Sequence[str] | None = None) -> int:
     args = list(sys.argv[1:] if args is None else args) or ["--help"]
     command = typer.main.get_command(app)
     try:
-        with heard():
+        with repeat_interrupts():
             code = command.main(args, prog_name="hmmseg", standalone_mode=False) or 0
             sys.stdout.flush()
             return code
@@ -146,15 +145,15 @@ def main(args: Sequence[str] | None = None) -> int:
     except UsageError as error:
         context = getattr(error, "ctx", None)
         path = context.command_path if context else "hmmseg"
-        said = error.format_message().partition("Traceback (most recent call last)")[0]  # type: ignore[attr-defined]
-        return _at_fault(f"{path}: {said.strip() or 'a value that cannot be read'} (see {path} --help)")
+        message = error.format_message().partition("Traceback (most recent call last)")[0]  # type: ignore[attr-defined]
+        return _at_fault(f"{path}: {message.strip() or 'a value that cannot be read'} (see {path} --help)")
     except typer.Abort:
         return 130
 
 
 def _at_fault(line: str) -> int:
     with contextlib.suppress(OSError, ValueError):
-        print(visible(" ".join(line.split())), file=sys.stderr)
+        print(escape_control(" ".join(line.split())), file=sys.stderr)
     try:
         sys.stdout.flush()
     except (OSError, ValueError):
@@ -163,7 +162,7 @@ def _at_fault(line: str) -> int:
 
 
 def _open_streams() -> None:
-    """Streams that were closed refuse what is written to them; names that are no UTF-8 can be printed."""
+    """Replace closed streams, and let names that are not UTF-8 be printed."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -174,5 +173,12 @@ def _open_streams() -> None:
         sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: SIM115
 
 
+def run() -> NoReturn:
+    """Run the command line as a process, whose exit code no interrupt changes once all is written."""
+    code = main()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(code)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

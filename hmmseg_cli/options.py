@@ -1,4 +1,4 @@
-"""Arguments and options of all commands, each declared once: its type, its flag and its line of help."""
+"""Arguments and options of all commands: type, flag and line of help."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Paths = list[Path] | None
 
 
 def option(flag: str, metavar: str | None, text: str, *, of: str | None = None, **more: Any) -> Any:
-    """An option with its help, in the group `of` options where one is named."""
+    """An option with its help, in the group `of` if one is named."""
     return typer.Option(*flag.split(), metavar=metavar, help=text, rich_help_panel=of, **more)
 
 

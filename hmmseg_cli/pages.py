@@ -1,4 +1,4 @@
-"""Pages of `--report`: one self-contained HTML file each, figures inside, for who must act on it."""
+"""Pages of `--report`: one self-contained HTML file each, with its figures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def rendered(template: str, **values: Any) -> str:
-    """A page of the templates' folder; a name that it lacks is an error."""
+    """A page from the templates' folder; a name that is undefined in it is an error."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
@@ -44,7 +44,7 @@ def rendered(template: str, **values: Any) -> str:
 
 
 def embedded(draw: Callable[[Callable[[str], Path]], Any]) -> dict[str, str]:
-    """PNGs that `draw` draws at the paths that it is given for their names, by stem as data URLs."""
+    """PNGs as data URLs, by stem; `draw` gets a function from a file name to the path to draw at."""
     with tempfile.TemporaryDirectory(prefix="hmmseg_") as folder:
         draw(lambda name: Path(folder) / name)
         return {
@@ -54,7 +54,7 @@ def embedded(draw: Callable[[Callable[[str], Path]], Any]) -> dict[str, str]:
 
 
 def _picture(draw: Callable[..., Any], caption: str, *args: Any, **more: Any) -> dict[str, str]:
-    """A figure with its caption; `draw` takes its path last."""
+    """A figure with its caption; `draw` takes the path as its last positional argument."""
     (data,) = embedded(lambda path: draw(*args, path("figure.png"), **more)).values()
     return {"data": data, "caption": caption}
 
@@ -63,7 +63,7 @@ def identification_page(
     trials: Sequence[Trial], segmentations: Sequence[Segmentation], body: dict[str, Any],
     found: Identification | None, measured: Actual | None, warnings: Sequence[str],
 ) -> str:  # fmt: skip
-    """HTML of one identification."""
+    """HTML page of one identification."""
     what = "Estimates with 68 and 95 % intervals"
     figures = [_picture(draw_estimates, what, body["properties"], measured)]
     if found is not None and found.names:
@@ -116,15 +116,17 @@ def _verdict(obj: str, entry: dict[str, Any]) -> str:
 
 Body = Mapping[str, Any]
 MOST = 8  # look: rows of a table
-NOTHING = 5e-3  # look: probability, or share of a gap, that is shown as none
-SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # in per cent if unitless
+NOTHING = 5e-3  # look: probability, or share of a gap, below which it is shown as none
+SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # in per cent if dimensionless
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What a page shows apart from the body: recordings, the rig's pads, measured values,
-    how each effect would show, and of a robot how its logs' columns say quantities that are not in SI there,
-    and where the motion to run next is.
+    """Contents of a page apart from the body.
+
+    `files`: recordings; `rig`: its pads; `measured`: independent values of properties; `shows`: signature of
+    each effect; `own`: by part of a robot, the unit in which its logs give a quantity that they do not give
+    in SI; `motion`: place of the motion to run next.
     """
 
     files: Sequence[str]
@@ -137,7 +139,7 @@ class Setting:
 
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
-    """The page as text; `draw(path)` draws figures at path(name.png), which are embedded."""
+    """HTML page of one diagnosis; `draw(path)` draws figures at path(name.png), which are embedded."""
     images = embedded(draw)
     effect = body["effects"].get("+".join(body["causes"]))
     fitted = (body.get("calibrated") or {}).get("parameters") or {}
@@ -178,7 +180,7 @@ def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[st
 
 
 def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setting) -> list[tuple[str, ...]]:
-    """Parameter, the model's value where it is known, what was found, interval."""
+    """Rows of the parameter, the model's value if known, the estimate and its interval."""
     rows = []
     for name, p in effect["parameters"].items():
         cause = next((c for c in causes if name.startswith(f"{c}.")), causes[0])
@@ -196,8 +198,7 @@ def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setti
 def _values(
     name: str, p: Mapping[str, Any], shown: tuple[float, str], setting: Setting
 ) -> tuple[str, str, str]:
-    """The model's value, what was found and its interval; each in its column's own unit too, where it has
-    one."""
+    """The model's value, the estimate and its interval, each also in its column's own unit if it has one."""
     part, _, last = name.rpartition(".")
     own = setting.own.get(part, setting.own.get(part.partition(":")[2]))
     both = [shown]
@@ -217,29 +218,29 @@ def _values(
 
 
 def _numerics(body: Body) -> str:
-    """What the simulation's own step and the hold of commands are, in a line."""
+    """The simulation's own time step and the hold of commands, in one sentence."""
     known = {
         "option.timestep": "the solver's step by {:+.0%}",
         "option.late": "commands come {:.2f} of a sample late",
         "option.hold": "commands are held {:.0%} of the way from a step to a line",
     }
-    said = [
+    parts = [
         text.format(abs(v["after"]) if name == "option.hold" else v["after"])
         for name, text in known.items()
         if (v := (body.get("numerics") or {}).get(name)) and abs(v["after"]) > 0.05
     ]
-    return f"Fitted as well, and never a cause: {'; '.join(said)}." if said else ""
+    return f"Fitted as well, and never a cause: {'; '.join(parts)}." if parts else ""
 
 
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:
-    """Every effect that was looked at: how probably it acts, what it explains and where it would show."""
+    """Rows of all candidates: probability, share of the gap, and where the effect would show."""
     attribution = body.get("attribution") or {}
     rows = []
     for name, chance in sorted(finding.chances(body).items(), key=lambda row: -row[1])[:MOST]:
         own, share = attribution.get(name), ""
         idle = own and own.get("share") is not None and own["share"] < NOTHING
         if name not in body["causes"] and (chance < NOTHING or idle):
-            continue  # what explains nothing, however well it would go with the rest
+            continue  # explains nothing, even if it is compatible with the rest
         if own and own.get("share") is not None and own["probability"] >= 0.01:
             ends = between(*(own.get("interval_90") or (None, None)))
             share = percent(own["share"]) + (f" ({ends})" if ends else "")

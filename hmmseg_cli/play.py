@@ -28,7 +28,7 @@ def play(
     json: opt.Json = None, seed: opt.Seed = 0, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """The virtual blocks in a browser: the mouse holds the fingertips; a session is saved as a trial."""
-    configure(steady=True)  # steps have a deadline, and are not handed to another thread
+    configure(steady=True)  # steps have a deadline, so they run in the calling thread
     check_folder("--output", output)
     with Output("play", json=json, seed=seed, quiet=quiet) as out:
         try:
@@ -66,9 +66,9 @@ async def _serve(out: Output, server: PlayServer, port: int, open_page: bool) ->
 
 
 def diagnosed(path: Path) -> dict[str, dict[str, float]]:
-    """Effects and their values as a diagnosis has them; none where it is no diagnosis.
+    """Effects and their values from a diagnosis; none for any other file.
 
-    InputError where it names no cause, or only causes that cannot be felt.
+    InputError if it names no cause, or one that cannot be felt.
     """
     from simgap.play.world import effect_values, felt_effects
 

@@ -1,4 +1,4 @@
-"""Rows of CSV on a stream: separators, decimal commas, comments, units and ISO stamps as files have them."""
+"""Rows of CSV from a stream, with the separators, decimal commas, comments, units and ISO stamps of files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMMENT = tuple(sign.encode() for sign in COMMENTS)
 
 
 def _text(line: bytes) -> str:
-    """A header as the spreadsheets of western Europe write it, or in UTF-8."""
+    """Decode a header in UTF-8, or as spreadsheets in western Europe write it."""
     try:
         return line.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -29,9 +29,9 @@ def _text(line: bytes) -> str:
 
 
 class Rows:
-    """Rows of a CSV stream as (t, channels in SI units); `next` gives None at its end.
+    """Rows of a CSV stream as (t, channels in SI units).
 
-    InputError names the header's column or the row at fault, rows counted as an editor does.
+    InputError names the column of the header or the row at fault, counted as an editor does.
     """
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
@@ -46,7 +46,7 @@ class Rows:
         names = [name.strip() for name in cells_of(header, self._separator)]
         check_unique(names, WHERE)
         self._num, self._names, self._picked, self._scales = len(names), names, [], []
-        self._unstated: list[int] = []  # of what the rig says no unit
+        self._unstated: list[int] = []  # channels without a unit in the rig
         columns = watcher.filter.rig.columns
         for ours in ("t", *watcher.channels):
             theirs = source_of(ours, columns)
@@ -94,7 +94,7 @@ class Rows:
         return values[0], values[1:]
 
     def _line(self) -> bytes:
-        """The next line that is no comment and not empty; nothing at the stream's end."""
+        """The next line that is neither a comment nor empty; empty at the end of the stream."""
         while line := self._stream.readline():
             self._number += 1
             if line.strip() and not line.lstrip().startswith(COMMENT):
@@ -102,7 +102,7 @@ class Rows:
         return line
 
     def _take_units(self, cells: list[str]) -> bool:
-        """Whether a first row holds the columns' units, which then count where the rig says none."""
+        """Whether a first row holds units, which then apply where the rig states none."""
         units = units_of(self._names, cells)
         for at in self._unstated if units else ():
             unit = units.get(self._names[self._picked[at]])
@@ -115,8 +115,8 @@ class Rows:
         return all(scale == (1.0, 0.0) for scale in self._scales) and -1 not in self._picked
 
     def _number_in(self, cells: list[str], i: int) -> float:
-        """A cell that is no plain number: empty, quoted, with a decimal comma, or an ISO stamp as s since the
-        first."""
+        """A cell that is not a plain number: empty, quoted, with a decimal comma, or an ISO stamp, which
+        becomes s since the first."""
         text = "" if i < 0 else cells[i].strip().strip('"')
         if not text:
             return math.nan
@@ -125,9 +125,7 @@ class Rows:
         with contextlib.suppress(ValueError):
             return float(text)
         if i == self._picked[0] and text[:4].isdigit():
-            with contextlib.suppress(
-                ValueError, TypeError
-            ):  # the latter of a stamp with a zone after one without
+            with contextlib.suppress(ValueError, TypeError):  # TypeError: only one stamp has a zone
                 stamp = datetime.fromisoformat(text)
                 self._start = self._start or stamp
                 return (stamp - self._start).total_seconds()

@@ -13,7 +13,7 @@ from hmmseg.io.task import BlockTask, SequenceTask, read_task
 from hmmseg.segmentation.spans import most_telling, spans_table, trials_table
 from hmmseg_cli import options as opt
 from hmmseg_cli.batch import recordings_in, segment_apart
-from hmmseg_cli.console import Output, described, distinct_trials, needed, read_trials
+from hmmseg_cli.console import Output, distinct_trials, find_inputs, read_trials, require_rig
 from hmmseg_cli.options import Segmenter
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def segment(
         apart, recordings = workers is not None or scheduler is not None, []
         paths = distinct_trials(recordings_in(trials) if apart else trials)
         check_destination(write, paths)
-        task, rig = described(paths, task, rig)
+        task, rig = find_inputs(paths, task, rig)
         description = read_task(task)
         if isinstance(description, SequenceTask):
             if apart:
@@ -49,7 +49,7 @@ def segment(
                 raise InputError("--method qualitative", "needs a task of blocks", "--method hmm")
             recordings, found = _segment_sequence(out, paths, description, rig, model)
         else:
-            rig = needed(rig, paths)
+            rig = require_rig(rig, paths)
             if model is not None:
                 raise InputError(f"--model {model}", "goes only with a plain ordered task")
             if not apart:
@@ -80,8 +80,9 @@ def _segment_blocks(
     out: Output, paths: Sequence[Path], task: BlockTask, rig_file: Path,
     thresholds: tuple[float, float] | None, lean: bool,
 ) -> tuple[list[Trial], list[Segmentation]]:  # fmt: skip
-    """The recordings and their segmentations, by the paper's thresholds where such are given. Long ones of a
-    repeated task are read from disk where nothing else needs them (`lean`)."""
+    """Recordings and their segmentations, by the paper's `thresholds` if given, else by the HMM.
+
+    Long recordings of a repeated task are read from disk if nothing else needs them (`lean`)."""
     from hmmseg.hand.read import is_long
     from hmmseg.hand.signals import task_space
     from hmmseg.segmentation.align import segment
@@ -100,7 +101,7 @@ def _segment_blocks(
 def _segment_apart(
     out: Output, paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None
 ) -> list[Segmentation]:
-    """Each recording by itself, in other processes."""
+    """Segment each recording by itself, in other processes."""
     found = []
     with out.progress("segmenting", len(paths)) as advance:
         for each in segment_apart(paths, task, rig, workers, scheduler, advance, out.warn):
@@ -114,7 +115,7 @@ def _segment_apart(
 
 
 def _segment_long(out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig) -> list[Segmentation]:
-    """Each recording by itself, from disk; what cannot be is judged by its beginning."""
+    """Segment each recording by itself, from disk, after checking its beginning."""
     from hmmseg.hand.read import LongRecording, check
     from hmmseg.segmentation.align import segment_long
 
@@ -137,7 +138,7 @@ def _segment_sequence(
 
 
 def warn_of_misfits(out: Output, found: Sequence[Segmentation]) -> None:
-    """Say which subtask each trial fails at that does, in every repetition that does."""
+    """Warn of the subtask at which each misfit fails, in every repetition that does."""
     for segmentation in found:
         failures = segmentation.failures or filter(None, [segmentation.failed])
         out.warn(*(f"{segmentation.file}: {failure}" for failure in failures))

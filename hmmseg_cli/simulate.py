@@ -69,7 +69,8 @@ def simulate(
 def _perform(
     out: Output, task: BlockTask, rig: Rig, blocks: Blocks, count: int, operator: Path | None
 ) -> tuple[dict[str, str], dict[str, Any], Films]:
-    """Trials by the model's own operator: files by name, their part of the document, and what to film."""
+    """Trials by the model's own operator: files by name, their part of the document, and scenes to
+    animate."""
     import numpy as np
 
     from simgap.patch import performed
@@ -98,7 +99,8 @@ def _perform(
 def _replay(
     out: Output, path: Path, task: BlockTask, rig: Rig, blocks: Blocks
 ) -> tuple[dict[str, str], dict[str, Any], Films]:
-    """A recording's motions through the model: files by name, their part of the document, what to film."""
+    """A recording's motions through the model: files by name, their part of the document, scenes to
+    animate."""
     import numpy as np
 
     from hmmseg.contact.decompose import subtasks
@@ -140,7 +142,7 @@ def _replay(
 
 
 def _spare_inputs(folder: Path, names: Mapping[str, str], inputs: Iterable[Path | None]) -> None:
-    """InputError where writing would replace a file that was read."""
+    """InputError if a file to be written is one of the inputs."""
     targets = {(folder / name).resolve() for name in names}
     for path in inputs:
         if path is not None and path.resolve() in targets:
@@ -148,16 +150,16 @@ def _spare_inputs(folder: Path, names: Mapping[str, str], inputs: Iterable[Path 
 
 
 def _draw_replay(result: Replay, segmentation: Segmentation, path: Path) -> None:
-    """Grip, net and shear forces measured and predicted, over coloured subtasks."""
-    from hmmseg.plot.spans import Panel, stacked_panels
+    """Plot measured and predicted grip, net and shear forces over coloured subtasks."""
+    from hmmseg.plot.spans import stacked_panels
     from hmmseg.plot.style import BLUE, canvas
 
     signals, predicted = result.signals, result.predicted
     labels = {"grip": "Grip\n[N]", "fx": "Net $f_x$\n[N]", "fy": "Net $f_y$\n[N]", "shear": "Shear\n[N]"}
-    panels = [Panel(label, getattr(signals, key)) for key, label in labels.items()]
+    panels = {"Distance\n[cm]": 100 * signals.distance}
+    panels |= {label: getattr(signals, key) for key, label in labels.items()}
     with canvas(path, height=6.4) as figure:
-        distance = Panel("Distance\n[cm]", 100 * signals.distance)
-        axes = stacked_panels(figure, signals.t, [distance, *panels], segmentation)
+        axes = stacked_panels(figure, signals.t, panels, segmentation)
         for ax, key in zip(axes[1:], labels, strict=True):
             ax.plot(signals.t, predicted[key], color=BLUE, lw=0.9, label="virtual model")
         axes[1].lines[0].set_label("recording")

@@ -1,4 +1,4 @@
-"""`hmmseg watch`: a recording as it comes on standard input, one line of JSON a row."""
+"""`hmmseg watch`: follow a recording on standard input, with one line of JSON per row."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from hmmseg.online.watcher import Watcher
     from hmmseg_cli.rows import Rows
 
-SAID = {
+COUNTED = {
     "gaps": "gaps between rows", "late": "late rows put in their place",
     "repeated": "repeated rows counted once",
     "too late": "rows later than the lag left out", "contradictory": "second rows for one time left out",
@@ -49,8 +49,8 @@ def watch(
         watcher = Watcher(task, rig, lag)
         rows = Rows(sys.stdin.buffer, watcher)
         _warm_up(watcher)
-        show = Live(watcher, lines=not sys.stdout.isatty()) if plot else None
-        write = out.write if show is None or show.lines else None
+        show = Live(watcher) if plot else None
+        write = None if plot and sys.stdout.isatty() else out.write
         try:
             _follow(watcher, rows, write, show, skip_bad_rows, out)
         finally:
@@ -58,7 +58,7 @@ def watch(
             if show is not None:
                 show.close()
         final = watcher.finish()
-        for key, text in SAID.items():
+        for key, text in COUNTED.items():
             if watcher.counts[key]:
                 out.warn(f"{watcher.counts[key]} {text}")
         envelope = {"format": "hmmseg.watch/1", "version": hmmseg.__version__, "seed": seed,
@@ -73,16 +73,13 @@ def watch(
 
 
 def _follow(
-    watcher: Watcher,
-    rows: Rows,
-    write: Callable[[str], None] | None,
-    show: Live | None,
-    skip: bool,
+    watcher: Watcher, rows: Rows, write: Callable[[str], None] | None, show: Live | None, skip: bool,
     out: Output,
-) -> None:
+) -> None:  # fmt: skip
+    """Answer row after row until the stream ends, or nobody reads any more."""
     gc.collect()
     gc.freeze()
-    gc.disable()  # nothing here makes cycles, and a collection would hold up a row
+    gc.disable()  # nothing here makes cycles, and a collection would delay a row
     while True:
         try:
             row = rows.next()
@@ -99,14 +96,14 @@ def _follow(
         answer = watcher.update(*row)
         if write is not None:
             write(answer.line() + "\n")
-            if out.lost and out.json is None:  # nobody reads, and there is nothing else to write
+            if out.lost and out.json is None:  # no reader is left, and no file to write
                 return
         if show is not None:
             show.update(answer)
 
 
 def _warm_up(watcher: Watcher) -> None:
-    """Load what is compiled, or slow to import, before the first row comes."""
+    """Compile and import everything before the first row."""
     import numpy as np
 
     from hmmseg.online.filter import Filter
@@ -125,16 +122,15 @@ def _warm_up(watcher: Watcher) -> None:
     scratch.finish().line()
 
 
-REFRESH = 0.1  # look: s; a terminal shows no more
+REFRESH = 0.1  # look: s between pictures; a terminal shows no more
 WIDTH = 60  # numerics: points of a signal
-SECONDS = 10.0  # look: that it spans
+SECONDS = 10.0  # look: that a signal spans
 
 
 class Live:
-    """The display; `lines`: whether lines of JSON go to standard output as well."""
+    """The display in the terminal."""
 
-    def __init__(self, watcher: Watcher, lines: bool) -> None:
-        self.lines = lines
+    def __init__(self, watcher: Watcher) -> None:
         self._watcher, self._shown = watcher, 0.0
         self._kept: deque[tuple[float, float, float]] = deque(maxlen=WIDTH)
         self._notes: deque[str] = deque(maxlen=3)
@@ -144,7 +140,7 @@ class Live:
         self._last: Answer | None = None
 
     def update(self, answer: Answer) -> None:
-        """Take one answer; redraw if it is time to."""
+        """Take one answer, and redraw if it is time to."""
         if answer.note is not None:
             self._notes.append(f"{answer.t:.2f} s  {answer.note}")
         if not self._kept or answer.t >= self._kept[-1][0] + SECONDS / WIDTH:
@@ -168,9 +164,8 @@ class Live:
 def picture(
     watcher: Watcher, answer: Answer, kept: Sequence[tuple[float, float, float]], notes: Sequence[str]
 ) -> Group:
-    """What is known, drawn: bars of the subtasks, the grip and the net vertical force, properties, notes."""
-    step, then = answer.subtask, answer.next
-    failed = answer.failed
+    """Bars of the subtasks, grip and net vertical force, properties and notes."""
+    step, then, failed = answer.subtask, answer.next, answer.failed
     fits = Text("fits its task", "green")
     if failed is not None:
         fits = Text(f"does not fit its task at {failed['subtask']}: {failed['reason']}", "bold red")
@@ -193,6 +188,6 @@ def picture(
 
 
 def spark(values: Sequence[float]) -> str:
-    """Forces [N] as a row of bars from 0 or less, a blank where nothing is, the greatest named."""
+    """Forces [N] as a row of bars from 0 or less, blank where missing, with their maximum."""
     there = [v for v in values if math.isfinite(v)]
     return f"{sparkline((0.0, *values))[1:]} {max(there):.2f} N at most" if there else ""

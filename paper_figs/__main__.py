@@ -11,29 +11,13 @@ from collections.abc import Callable
 from paper_figs import properties, recording, virtual_block
 from paper_figs.gap_reliability import gap_reliability
 
-FIGURES: dict[str, Callable[[], None]] = {
-    draw.__name__: draw
-    for draw in (
-        recording.fig03,
-        recording.fig05,
-        recording.fig06,
-        recording.fig07,
-        recording.fig08,
-        recording.fig09,
-        virtual_block.fig11,
-        virtual_block.fig12,
-        virtual_block.fig13,
-        virtual_block.fig14,
-        virtual_block.replay,
-        properties.table4,
-        properties.rigid,
-        properties.slip,
-        properties.corner,
-        properties.prior_posterior,
-        recording.alignments,
-        gap_reliability,
-    )
-}
+DRAWN: tuple[Callable[[], None], ...] = (
+    recording.fig03, recording.fig05, recording.fig06, recording.fig07, recording.fig08, recording.fig09,
+    virtual_block.fig11, virtual_block.fig12, virtual_block.fig13, virtual_block.fig14, virtual_block.replay,
+    properties.table4, properties.rigid, properties.slip, properties.corner, properties.prior_posterior,
+    recording.alignments, gap_reliability,
+)  # fmt: skip
+FIGURES = {draw.__name__: draw for draw in DRAWN}
 
 
 def main() -> None:

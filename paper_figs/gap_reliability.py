@@ -1,4 +1,4 @@
-"""How often a statement of the blind check comes true, by the probability it was given."""
+"""Reliability of the blind check's probabilities."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PANELS = (
 
 
 def gap_reliability() -> None:
-    """Shares that come true against what was said, of verdicts and of single effects."""
+    """Plot the share that came true against the stated probability, for verdicts and single effects."""
     found = json.loads(RESULTS.read_text(encoding="utf-8"))["table"]
     with canvas(target("gap_reliability"), height=3.2) as figure:
         for ax, (key, words) in zip(figure.subplots(1, 2), PANELS, strict=True):

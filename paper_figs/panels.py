@@ -1,4 +1,4 @@
-"""Panels over time, and pictures of fingers and blocks, as several of the paper's figures need them."""
+"""Panels over time and pictures of fingers and blocks, shared by several of the paper's figures."""
 
 from __future__ import annotations
 
@@ -42,16 +42,8 @@ def state_handles(states: Iterable[str] = ("free-motion", "hold-on-ground", "hol
 def name_marks(ax: Axes, marks: Iterable[tuple[float, str]], height: float = 0.97) -> None:
     """Short names at times, along the top of a panel."""
     for time, text in marks:
-        ax.text(
-            time,
-            height,
-            text,
-            transform=ax.get_xaxis_transform(),
-            ha="center",
-            va="top",
-            fontsize=7.5,
-            style="italic",
-        )
+        ax.text(time, height, text, transform=ax.get_xaxis_transform(), ha="center", va="top",
+                fontsize=7.5, style="italic")  # fmt: skip
 
 
 def thresholds(ax: Axes) -> None:
@@ -61,7 +53,7 @@ def thresholds(ax: Axes) -> None:
 
 
 def only(values: Sequence[float], chosen: Sequence[int]) -> np.ndarray:
-    """Values where chosen, NaN elsewhere, so that lines break."""
+    """Values where `chosen`, else NaN, so that lines break."""
     return np.where(np.asarray(chosen, bool), np.array(values, float), np.nan)
 
 
@@ -103,18 +95,8 @@ def scene(
         ax.add_patch(_box(far, bottom, SHANK, SHANK_HEIGHT, facecolor="#9AA5AE", edgecolor=INK, lw=0.4))
     for name, (x, y) in blocks.items():
         width, height = sizes[name]
-        ax.add_patch(
-            _box(
-                x - width / 2,
-                y - height / 2,
-                width,
-                height,
-                facecolor=BLOCK_COLOURS[name],
-                edgecolor=INK,
-                lw=0.5,
-                zorder=3,
-            )
-        )
+        ax.add_patch(_box(x - width / 2, y - height / 2, width, height, facecolor=BLOCK_COLOURS[name],
+                          edgecolor=INK, lw=0.5, zorder=3))  # fmt: skip
         if names:
             ax.text(100 * x, 100 * y, name[-1], ha="center", va="center", fontsize=7, zorder=4)
     ax.axhline(0, color=INK, lw=0.8, zorder=2)

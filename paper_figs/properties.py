@@ -1,4 +1,4 @@
-"""Figures of the properties: estimates, posteriors, and why the paper's widths and heights were off."""
+"""Figures of the properties: estimates, posteriors, and the errors of the paper's widths and heights."""
 
 from __future__ import annotations
 
@@ -89,7 +89,8 @@ def table4() -> None:
 
 
 def rigid() -> None:
-    """Widths under rigid fingertips: how short, and which pads or grips the paper's own figures need."""
+    """Widths under rigid fingertips: their shortfall, and the pads or grips that the paper's figures
+    imply."""
     found = load("rigid")
     needed = found["needed"]
     with canvas(target("rigid"), height=3.3) as figure:
@@ -315,7 +316,7 @@ def draw_property(ax: Axes, found: dict[str, Any], k: int) -> None:
 
 
 def prior_posterior() -> None:
-    """What was known before and after: prior, posterior of one recording and of ten."""
+    """Prior, and posterior of one recording and of ten."""
     found = load("posterior")
     with canvas(target("prior_posterior"), height=4.4) as figure:
         axes = figure.subplots(2, 3)

@@ -1,4 +1,4 @@
-"""Figures of one recording: subtasks, signals, states, what of them gives properties, alignments."""
+"""Figures of one recording: subtasks, signals, states, samples used for properties, alignments."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def fig07() -> None:
 
 
 def fig08() -> None:
-    """Figure 8: the net vertical force, and what of it gives the weights."""
+    """Figure 8: the net vertical force, and the samples that give the weights."""
     found = load("recording")
     force, used = np.array(found["signals"]["fy"]), np.array(found["used"]["weight"], bool)
     t = np.array(found["t"])
@@ -140,7 +140,7 @@ def fig08() -> None:
 
 
 def fig09() -> None:
-    """Figure 9: the height of the right finger, and what of it gives the heights."""
+    """Figure 9: the height of the right finger, and the samples that give the heights."""
     found = load("recording")
     t, y = np.array(found["t"]), 100 * np.array(found["signals"]["y2"])
     used = np.array(found["used"]["height"], bool)

@@ -1,4 +1,4 @@
-"""Where saved results and drawn figures lie."""
+"""Paths of saved results and figures."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ FIGURES = ROOT / "docs" / "figures"
 
 
 def load(name: str) -> dict[str, Any]:
-    """The results that `python -m experiments.paper` saved under this name, less its commit."""
+    """Results saved by `python -m experiments.paper` under a name, without their commit."""
     found = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
     return {key: value for key, value in found.items() if key != "made_by"}
 
 
 def target(name: str) -> Path:
-    """Where a figure goes."""
+    """Path of a figure."""
     FIGURES.mkdir(parents=True, exist_ok=True)
     return FIGURES / f"{name}.png"

@@ -134,7 +134,7 @@ def fig14() -> None:
 
 
 def replay() -> None:
-    """A healthy recording replayed through the calibrated model: forces, and what is left of them."""
+    """Draw a healthy recording replayed through the calibrated model: forces and residuals."""
     found = load("replay")
     t = np.array(found["t"])
     edges = [t[0], *found["boundaries"], t[-1]]

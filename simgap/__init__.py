@@ -1,6 +1,6 @@
 """The virtual model of a hand and its blocks, and the gap between it and a recording.
 
-Names that are not listed here are internal.
+Names not listed here are internal.
 """
 
 from hmmseg._lazy import lazily

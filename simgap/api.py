@@ -1,4 +1,4 @@
-"""The public functions `simulate` and `diagnose`: they take paths and tables as well as what was read."""
+"""The public functions `simulate` and `diagnose`, which accept paths and tables as well as parsed objects."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from typing import Any
 from estimation.identification import Identification
 from estimation.report import parse_actual, read_actual
 from hmmseg.api import Source, align, block_task
+from hmmseg.contact.decompose import UNITS
 from hmmseg.io.rig import Rig
+from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.align import AlignedTrials
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.diagnose import diagnose as diagnose_blocks
 from simgap.world.operator import OperatorSettings
-from simgap.world.properties import Block, Blocks, paper_blocks, read_properties
+from simgap.world.properties import DEFAULT_FRICTION, Block, Blocks, paper_blocks, read_properties
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 
@@ -26,15 +28,15 @@ def simulate(
     seed: int = 0,
     operator: OperatorSettings | None = None,
 ) -> list[SimulatedTrial]:
-    """Trials of the virtual model, performed by a simulated operator, each with its truth.
+    """Simulate trials of the virtual model, performed by a simulated operator, with their truth.
 
     Args:
         task: A task of blocks: a path, a dict, or the result of `Task.read`.
         rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
         properties: An identification, blocks by name, or a file (identify's JSON, an `actual.toml`); the
             paper's blocks by default.
-        trials: How many.
-        seed: Of the first trial; each further one has the next.
+        trials: Number of trials.
+        seed: Seed of the first trial; each further trial has the next one.
         operator: Ranges from which motions are drawn.
 
     Returns:
@@ -73,7 +75,7 @@ def diagnose(
         task: A path, a dict, or the result of `Task.read`.
         rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
         actual: Properties measured independently of the trials: a path or a dict.
-        effects: Causes that are given instead of chosen.
+        effects: Causes to impose instead of choosing them.
         healthy: Recordings of the same task and hand that replace simulated healthy twins as the null.
         seed: Seed of all random draws.
         progress: Called with a description of each stage.
@@ -101,18 +103,21 @@ def diagnose(
     )
 
 
-def _blocks(properties: Any, task: Any) -> Blocks:
+def _blocks(properties: Any, task: BlockTask) -> Blocks:
+    """Blocks for every object of a task, from any of the sources that `simulate` accepts."""
     if properties is None:
         return paper_blocks(task)
     if isinstance(properties, Identification):
-        return {name: _found(properties, name) for name in task.objects}
+        return {name: _identified(properties, name) for name in task.objects}
     if isinstance(properties, str | Path):
         return read_properties(properties, task)
     return properties
 
 
-def _found(found: Identification, name: str) -> Block:
-    weight, width, height = (float(found.of(name, key).mean()) for key in ("weight", "width", "height"))
+def _identified(found: Identification, name: str) -> Block:
+    """A block with the posterior means of its properties, and the default friction unless slip was seen."""
+    weight, width, height = (float(found.of(name, key).mean()) for key in UNITS)
     bound = found.friction.get(name)
-    known = None if bound is None or bound.mu_draws is None else float(bound.mu_draws.mean())
-    return Block(weight, width, height) if known is None else Block(weight, width, height, known)
+    draws = None if bound is None else bound.mu_draws
+    friction = DEFAULT_FRICTION if draws is None else float(draws.mean())
+    return Block(weight, width, height, friction)

@@ -1,23 +1,24 @@
-"""The least of a quadratic within bounds: the one solver that fits and weighs effects."""
+"""Minimum of a quadratic within bounds: the solver that fits and weighs effects."""
 
 from __future__ import annotations
 
 import numpy as np
 
-ROUNDING = 1e-12  # numerics: of the largest pull: a smaller slope draws nowhere
-PATIENCE = 3  # numerics: exchanges of many coordinates that do not help before one at a time is exchanged
+ROUNDING = 1e-12  # numerics: slopes below this share of the largest pull count as zero
+PATIENCE = 3  # numerics: exchanges of many coordinates without progress before one is exchanged at a time
 
 
 def least(
     matrix: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The x (n,) within [low, high] at which x' matrix x / 2 - pull x is least, and which are held (n,).
+    """The x (n,) within [low, high] that minimises x' matrix x / 2 - pull x, and whether each is at a bound
+    (n,).
 
-    `matrix` (n, n) is positive definite, so there is one. By block principal pivoting: coordinates past a
-    bound are held there, held ones that the slope draws inwards are released, all at once while that leaves
-    fewer of them, else the last one alone (Judice & Pires, Comput. Oper. Res. 21, 1994).
+    `matrix` (n, n) is positive definite, so the minimum is unique. Block principal pivoting: coordinates
+    beyond a bound are fixed there and fixed ones that the slope draws inwards are released, all at once while
+    their number decreases, else the last one alone (Judice & Pires, Comput. Oper. Res. 21, 1994).
     """
-    x, side = np.linalg.solve(matrix, pull), np.zeros(pull.size, int)  # side: -1 held low, 1 held high
+    x, side = np.linalg.solve(matrix, pull), np.zeros(pull.size, int)  # side: -1 fixed low, 1 fixed high
     slope, fewest, patience = np.zeros_like(x), pull.size + 1, PATIENCE
     nothing = ROUNDING * np.abs(pull).max(initial=0.0)
     while True:

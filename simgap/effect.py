@@ -1,7 +1,7 @@
-"""What an effect is, and what its parameters are: the same for blocks, robots, given trials and simulators.
+"""Effects and their parameters: the same base for blocks, robots, given trials and simulators.
 
-An effect is one mechanism that a model leaves out. What it does forward to a simulation and inversely to a
-recording depends on what it acts on: one channel of any table (`simgap.channels`), a hand that moves blocks
+An effect is one mechanism that a model leaves out. How it acts forward on a simulation and inversely on a
+recording depends on its domain: one channel of any table (`simgap.channels`), a hand that moves blocks
 (`simgap.effects`), or a robot's logs and its simulator (`simgap.robot_effects`).
 """
 
@@ -15,22 +15,23 @@ from typing import Any
 import numpy as np
 
 Array = Any  # np.ndarray, or a jax.Array under a trace
-STATED = ("nominal", "sd", "unit", "low", "high", "effect", "fitted")  # what a simulator says of a parameter
-GROSS = 100.0  # prior: times the usual size: a fault so large has been seen on the bench
+STATED = ("nominal", "sd", "unit", "low", "high", "effect", "fitted")  # by a simulator
+GROSS = 100.0  # prior: largest fault in standard deviations; faults so large have been seen on the bench
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter: its prior is normal about `nominal` with `sd`, in `unit`, within `low` and `high`.
+    """A parameter with a normal prior: mean `nominal`, standard deviation `sd`, in `unit`, within `low` and
+    `high`.
 
-    At the nominal value an effect changes nothing. `log`: the prior is of the logarithm, its median nominal
-    and `sd` in natural units. `starts` are the values a search starts from. `hidden` parameters are fitted
-    but not reported. `shape`: it bends what others amplify and is nothing by itself. `name` is given by the
-    effect that has it.
+    At its nominal value an effect changes nothing. `log`: the prior is normal in the logarithm, with median
+    `nominal` and `sd` in natural units. A search starts from each of `starts`. `hidden` parameters are fitted
+    but not reported. A `shape` parameter modifies others and does nothing by itself. `name` is set by the
+    effect that owns the parameter.
 
-    Of a simulator: parameters of the same `effect` act as one candidate cause; without one, a parameter is
-    its own. What is `fitted` was never measured (a friction, say): it is fitted along with every cause and is
-    none itself.
+    In a simulator, parameters with the same `effect` act as one candidate cause; without one, a parameter is
+    its own cause. A `fitted` parameter was never measured (a friction, say): it is fitted along with every
+    cause and is not one itself.
     """
 
     nominal: float
@@ -53,7 +54,7 @@ class Parameter:
             raise ValueError(f"nominal {self.nominal} lies outside of its bounds {self.low} to {self.high}")
 
     def value(self, u: Array) -> Array:
-        """The parameter from its standard normal coordinate."""
+        """The parameter's value at a standard normal coordinate."""
         return self.nominal * np.exp(self.sd * u) if self.log else self.nominal + self.sd * u
 
     def coordinate(self, value: float) -> float:
@@ -62,19 +63,19 @@ class Parameter:
 
     @property
     def gridded(self) -> bool:
-        """Whether a search has to try several start values of it."""
+        """Whether a search has to try several start values."""
         return bool(self.starts)
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Bounds of the coordinate: five standard deviations of a logarithm, GROSS of others, at most."""
+        """Bounds of the coordinate: at most five standard deviations of a logarithm, GROSS otherwise."""
         low = self.coordinate(self.low) if self.low > (0 if self.log else -np.inf) else -np.inf
         high = self.coordinate(self.high) if np.isfinite(self.high) else np.inf
         most = 5.0 if self.log else GROSS
         return max(low, -most), min(high, most)
 
     def scaled(self, factor: float, unit: str | None = None) -> Parameter:
-        """The same of a quantity so much as large, in another unit where one is given."""
+        """The parameter of a quantity `factor` times as large, in another unit if one is given."""
         return replace(self, nominal=self.nominal * factor, sd=self.sd * factor, low=self.low * factor,
                        high=self.high * factor, starts=tuple(factor * s for s in self.starts),
                        unit=self.unit if unit is None else unit)  # fmt: skip
@@ -82,9 +83,9 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """One mechanism: what it `says` as an equation, its `parameters` by name, where it `shows`.
+    """One mechanism: its equation `says`, its `parameters` by name, and where it `shows`.
 
-    `called`: the effect in plain words, and what to `check` on the hardware.
+    It is `called` in plain words, and `check` says what to examine on the hardware.
     """
 
     name: str
@@ -99,5 +100,5 @@ class Effect:
         object.__setattr__(self, "parameters", named)
 
     def neutral(self) -> dict[str, float]:
-        """Values at which nothing is changed (where those exist)."""
+        """Parameter values at which nothing is changed (if there are such)."""
         return {n: p.nominal for n, p in self.parameters.items()}

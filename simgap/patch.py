@@ -1,7 +1,7 @@
-"""From a diagnosis to a corrected virtual model: rig.toml with what was found, and ranges for training.
+"""A corrected virtual model from a diagnosis: rig.toml with the causes found, and ranges for training.
 
-`files` writes what `hmmseg diagnose --patch` puts into its folder; `replayed` and `performed` are the
-virtual model with a corrected rig, whose [effects] they apply.
+`files` gives what `hmmseg diagnose --patch` writes; `performed` and `replayed` run the virtual model of a
+corrected rig with its [effects].
 """
 
 from __future__ import annotations
@@ -13,59 +13,38 @@ from typing import Any
 
 import numpy as np
 import tomlkit
-from tomlkit.items import Table
 
 from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from simgap.effects import catalogue, effect_named
-from simgap.effects.base import KINEMATICS, Performance
+from simgap.effects.base import KINEMATICS, Performance, interval_comment, number, table
 from simgap.gap.twins import altered, carried, recorded, scene_of
 from simgap.gap.twins import performed as perform
+from simgap.world.dynamics import interpolated
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.replay import Replay, replay
 from simgap.world.simulate import SimulatedTrial, simulate_trials
-
-
-def table(document: tomlkit.TOMLDocument, name: str) -> Table:
-    """A table of a document, put at its end where it is not there."""
-    if name not in document:
-        document.add(tomlkit.nl())
-        document.add(name, tomlkit.table(name == "effects"))
-    return document[name]  # type: ignore[return-value]
-
-
-def number(value: float) -> float:
-    """Rounded to what a diagnosis can know."""
-    return float(f"{value:.6g}")
-
-
-def interval_comment(p: Mapping[str, Any]) -> str:
-    """A parameter's interval, for a comment."""
-    low, high = p["interval_90"]
-    unit = "" if p["unit"] == "1" else f" {p['unit']}"
-    return "interval unknown" if None in (low, high) else f"90 % interval {low:.4g} to {high:.4g}{unit}"
-
 
 Body = Mapping[str, Any]
 FORMAT = "hmmseg.ranges/1"
 
 
 def files(rig_text: str, body: Body) -> dict[str, str]:
-    """Write out a corrected virtual model.
+    """Write a corrected virtual model.
 
     Args:
         rig_text: The rig.toml that was diagnosed.
         body: The diagnosis's document.
 
     Returns:
-        By name the texts of three files; none where no cause was named. rig.toml is the given one, its
-        comments kept, with each found value's interval after it; what the rig has no number for is under
-        [effects], which `hmmseg simulate` applies. ranges.json holds every found parameter by its place in
-        rig.toml, and every block's properties, as mean, sd and 90 % interval in SI units. actual.toml holds
-        the blocks as identified with the causes in the model.
+        The contents of three files by name; empty if no cause was named. rig.toml is the given one with its
+        comments, and the interval of each corrected value after it; effects without a number of their own in
+        a rig are listed under [effects], which `hmmseg simulate` applies. ranges.json holds mean, sd and 90 %
+        interval of every parameter found, by its place in rig.toml, and every block's properties, in SI
+        units. actual.toml holds the blocks as identified with the causes in the model.
     """
     name = "+".join(body["causes"])
     entry = body["effects"].get(name)
@@ -79,19 +58,22 @@ def files(rig_text: str, body: Body) -> dict[str, str]:
             if len(body["causes"]) == 1 or k.startswith(f"{effect}.")
         }  # fmt: skip
         for parameter, place in _correct(document, effect, found).items():
-            ranges[place] = _range(found[parameter])
-    ranges = {k: v for k, v in ranges.items() if v["mean"] is not None}
+            p = found[parameter]
+            low, high = p["interval_90"]
+            if p["mean"] is not None:
+                ranges[place] = {k: p[k] for k in ("unit", "mean", "sd")} | {"low": low, "high": high}
     out = {"rig.toml": tomlkit.dumps(document)}
     blocks = _blocks(entry)
-    said = {"format": FORMAT, "causes": list(body["causes"]), "parameters": ranges, "blocks": blocks}
-    out["ranges.json"] = json.dumps(said, indent=1) + "\n"
+    found = {"format": FORMAT, "causes": list(body["causes"]), "parameters": ranges, "blocks": blocks}
+    out["ranges.json"] = json.dumps(found, indent=1) + "\n"
     if blocks:
-        out["actual.toml"] = _actual(blocks)
+        comment = "# Blocks as identified with the causes in the model: simulate --properties.\n\n"
+        out["actual.toml"] = comment + tomlkit.dumps(blocks)
     return out
 
 
 def _correct(document: tomlkit.TOMLDocument, effect: str, found: Mapping[str, Any]) -> dict[str, str]:
-    """Put one effect into the rig; the place of each parameter."""
+    """Put an effect into the rig; the place of each of its parameters."""
     known = catalogue().get(effect)
     places = known.patched(document, found) if known is not None and known.patched is not None else None
     if places is not None:
@@ -109,13 +91,8 @@ def _correct(document: tomlkit.TOMLDocument, effect: str, found: Mapping[str, An
     return {parameter: f"effects.{effect}.{parameter}" for parameter in found}
 
 
-def _range(p: Mapping[str, Any]) -> dict[str, Any]:
-    low, high = p["interval_90"]
-    return {"unit": p["unit"], "mean": p["mean"], "sd": p["sd"], "low": low, "high": high}
-
-
 def _blocks(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Properties by block, as the causes in the model leave them."""
+    """Block properties as they are with the causes in the model."""
     out: dict[str, Any] = {}
     for name, shift in (entry.get("property_shift") or {}).items():
         block, _, prop = name.rpartition(".")
@@ -123,16 +100,8 @@ def _blocks(entry: Mapping[str, Any]) -> dict[str, Any]:
     return out
 
 
-def _actual(blocks: Mapping[str, Any]) -> str:
-    document = tomlkit.document()
-    document.add(tomlkit.comment("Blocks as identified with the causes in the model: simulate --properties."))
-    for block, properties in blocks.items():
-        document[block] = properties
-    return tomlkit.dumps(document)
-
-
 def checked(effects: Mapping[str, Mapping[str, float]], where: str) -> None:
-    """InputError where [effects] of a rig names what the virtual model cannot apply."""
+    """InputError if [effects] of a rig names an effect that the virtual model cannot apply."""
     for name, values in effects.items():
         known = catalogue().get(name)
         if known is None or not known.simulated:
@@ -149,7 +118,7 @@ def checked(effects: Mapping[str, Mapping[str, float]], where: str) -> None:
 def performed(
     task: BlockTask, rig: Rig, blocks: Sequence[Blocks], seeds: Sequence[int], operator: OperatorSettings
 ) -> list[SimulatedTrial]:
-    """Trials by the model's own operator in the rig's scene, recorded by its sensors, with its [effects]."""
+    """Trials of the model's own operator in the rig's scene, recorded by its sensors under its [effects]."""
     if not rig.effects:
         return simulate_trials(task, rig, blocks, seeds, operator)
     done = perform(task, rig, blocks, seeds, rig.effects, operator)
@@ -159,11 +128,12 @@ def performed(
 def replayed(
     trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, boundaries: Sequence[float] | np.ndarray
 ) -> Replay:
-    """A recording's motions through the corrected model: `force` is what its sensors would have shown.
+    """Drive the corrected model with a recording's motion; `force` is what its sensors would have read.
 
-    Effects that can be are taken off the recorded angles before these drive the model. One that changes
-    angles and cannot (play, jitter) cannot be taken back and is left out of the motion.
+    Effects on the recorded angles are undone first, where that is possible. One that cannot be undone (play,
+    jitter) is left out of the motion.
     """
+
     if not rig.effects:
         return replay(trial, task, rig, blocks, boundaries=boundaries)
     hand, around, blocks = scene_of(rig, blocks, rig.effects)
@@ -173,16 +143,15 @@ def replayed(
             channels = restored(channels, dict(values))
     moved = replace(trial, channels=channels)
     found = replay(moved, task, hand, blocks, boundaries=boundaries, surroundings=around)
-    n, force = len(found.t), found.motion.force
     truth = Performance(
-        found.t, found.motion.position, found.motion.velocity, force.reshape(n, 2, 2),
+        found.t, found.motion.position, found.motion.velocity, found.motion.force,
         np.asarray(boundaries, float), rig, *carried(found.t, boundaries, task, blocks),
     )  # fmt: skip
     acting = sorted(map(effect_named, rig.effects), key=lambda e: -e.stage)
     felt = {e.name: rig.effects[e.name] for e in acting if e.stage != KINEMATICS}
     truth = altered(truth, felt, np.random.default_rng(0))
-    force = np.stack([np.interp(found.signals.t, found.t, c) for c in truth.force.reshape(n, 4).T], 1)
+    force = interpolated(found.signals.t, found.t, truth.force)
     for effect in acting:
         if effect.finish is not None:
             force = effect.finish(force, dict(rig.effects[effect.name]))
-    return replace(found, force=force.reshape(-1, 2, 2))
+    return replace(found, force=force)

@@ -1,4 +1,4 @@
-"""What a hand does to a block in each subtask, as the equations of the gap tell them apart."""
+"""The phases of manipulation that the equations of the gap distinguish."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hmmseg.contact.decompose import FREE as FREE_MOTION
 
 
 class Phase(IntEnum):
-    """Places of the phases in one-hot arrays."""
+    """Phases in the order of one-hot arrays."""
 
     FREE = 0
     PICKUP = 1

@@ -1,4 +1,4 @@
-"""How long work says what it is doing."""
+"""Progress messages of long computations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Progress = Callable[[str], None]
 
 
 def silent(text: str) -> None:
-    """Say nothing."""
+    """Ignore the message."""
 
 
 _LISTENS: ContextVar[Progress] = ContextVar("listens", default=silent)
@@ -18,7 +18,7 @@ _LISTENS: ContextVar[Progress] = ContextVar("listens", default=silent)
 
 @contextmanager
 def heard(listen: Progress) -> Iterator[None]:
-    """Within, what a long step is at is said to `listen`."""
+    """Send progress messages to `listen` within the context."""
     token = _LISTENS.set(listen)
     try:
         yield
@@ -27,5 +27,5 @@ def heard(listen: Progress) -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """What a long step is at, to whoever listens."""
+    """Send a progress message to the listener, if any."""
     _LISTENS.get()(text)

@@ -1,4 +1,4 @@
-"""Recursions over samples, compiled; to be imported late, as numba takes half a second."""
+"""Compiled recursions over samples; import late, as numba takes half a second to load."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from hmmseg.online.compiled import compiled
 
 @compiled
 def smoothed(t: np.ndarray, values: np.ndarray, tau: float, start: float) -> np.ndarray:
-    """tau y' + y = u (num_timesteps,), linear between the times `t` of its samples, from a `start` on."""
+    """Solution y of tau y' + y = u from y(t[0]) = `start`, for u (num_timesteps,) linear between times
+    `t`."""
     out = np.empty_like(values)
     out[0] = start
     for i in range(values.size - 1):
         step = t[i + 1] - t[i]
         late = tau * (values[i + 1] - values[i]) / step
-        # On each piece y = u - tau slope + decaying rest.
+        # On each piece y = u - tau slope + a decaying rest.
         out[i + 1] = values[i + 1] - late + np.exp(-step / tau) * (out[i] - values[i] + late)
     return out
 
 
 @compiled
 def play(values: np.ndarray, width: float) -> np.ndarray:
-    """The play operator: the output (n,) follows the input only where that pushes a side of the gap."""
+    """The play operator: the output (n,) follows the input only while it pushes a side of the gap."""
     out = np.empty_like(values)
     at = values[0]
     for i in range(values.size):
@@ -34,7 +35,7 @@ def play(values: np.ndarray, width: float) -> np.ndarray:
 
 @compiled
 def recursion(keep: np.ndarray, drive: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """y[k] = keep[k] y[k-1] + drive[k] along the samples of T trials (T, N), from a `start` (T,) on."""
+    """y[k] = keep[k] y[k-1] + drive[k] along the samples of T trials (T, N), from y[-1] = `start` (T,)."""
     out = np.empty_like(drive)
     for t in range(drive.shape[0]):
         y = start[t]
@@ -48,8 +49,8 @@ def recursion(keep: np.ndarray, drive: np.ndarray, start: np.ndarray) -> np.ndar
 def _update(
     mean: np.ndarray, cov: np.ndarray, lever: np.ndarray, value: float, weight: float, noise: float
 ) -> tuple[float, float]:
-    """Take one value, lever' state and noise of variance `noise` over `weight`, into `mean` (S,) and `cov`
-    (S, S) in place; the innovation, and its variance over the noise's, weighted."""
+    """Kalman update of `mean` (S,) and `cov` (S, S), in place, with one value: lever' state plus noise of
+    variance `noise` / `weight`. Returns the innovation and its variance over the noise's, weighted."""
     size = mean.size
     spread, inside, miss = np.zeros(size), 0.0, value
     for i in range(size):
@@ -72,18 +73,18 @@ def tracked(
     new: np.ndarray, anywhere: float, pinned: np.ndarray, place: np.ndarray, drift: np.ndarray,
     wander: np.ndarray, jump: np.ndarray, shares: np.ndarray, chance: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
-    """What a Kalman filter did not expect of four values (T, N, 4), where joints move unseen.
+    """Innovations of a Kalman filter on four values (T, N, 4) while joints move unseen in their dead bands.
 
-    Values are `levers` (T, N, 4, J) times where the J joints are in their dead bands, and noise `sd`; values
-    of less `weight` (0 to 1) tell less. The first, second and last also have a constant each, which walks
-    with variances `walk` (T, N, 3) and is another one, with variance `anywhere`, where it is `new` (T, N,
-    3): the first value of weight sets it and tells nothing. A joint is at its `place` (T, N, J) where it is
-    `pinned`; elsewhere it goes on by `drift`, with variance `wander`, and by one of `shares` (R,) of the
-    variance `jump` (T, J), of which `chance` (R,) are the prior probabilities. Of these the likeliest is
-    taken, sample by sample (a multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
+    Values are `levers` (T, N, 4, J) times the positions of the J joints in their bands, plus noise of
+    standard deviation `sd`; each has a `weight` from 0 to 1. The first, second and last value also have a
+    constant each, a random walk of variances `walk` (T, N, 3) that is replaced by a new one of variance
+    `anywhere` where `new` (T, N, 3): the first weighted value determines it and gives no innovation. A joint
+    is at its `place` (T, N, J) where `pinned`; elsewhere it moves by `drift` with variance `wander`, plus one
+    of `shares` (R,) of the variance `jump` (T, J) with prior probabilities `chance` (R,). The likeliest share
+    is chosen sample by sample (a multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
 
     Returns:
-        innovations (T, N, 4), their variances over the noise's, and what the choices cost [nats].
+        Innovations (T, N, 4), their variances over the noise's, and the cost of the choices [nats].
     """
     joints, size = pinned.shape[2], pinned.shape[2] + 3
     out, factor, cost = np.zeros_like(values), np.ones_like(values), 0.0

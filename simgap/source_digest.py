@@ -1,4 +1,4 @@
-"""A hash of the product's own source: what is kept between runs holds for the code that made it."""
+"""A hash of the product's source: cached results are valid only for the code that made them."""
 
 from __future__ import annotations
 

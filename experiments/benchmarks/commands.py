@@ -1,4 +1,4 @@
-"""Where the time of a command goes: stages of `segment` and `identify`, and whole commands, processor time.
+"""Processor time of the stages of `segment` and `identify`, and of whole commands.
 
     python -m experiments.benchmarks.commands RECORDING_FOLDER
 
@@ -20,7 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from experiments.saving import save
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 
 OUT = Path(__file__).parents[1] / "results" / "benchmark_commands.json"
 REPEATS = 3
@@ -60,7 +60,7 @@ def processor(arguments: list[str], cache: str | None = None) -> float:
 
 
 def staged(stages: dict[str, str], files: dict[str, str]) -> dict[str, dict[str, float]]:
-    """Processor time [s] of each stage, and its share of what a command does: all but the last."""
+    """Processor time [s] of each stage, and its share of the whole except the last stage."""
     lines, totals = [], [0.0]
     for line in stages.values():
         lines.append(line.format(**files))
@@ -69,11 +69,8 @@ def staged(stages: dict[str, str], files: dict[str, str]) -> dict[str, dict[str,
     return {name: {"processor": s, "share": s / totals[-2]} for name, s in zip(stages, each, strict=True)}
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/benchmarks.md: commands on one 10 s trial, by stage."""
-    found = load("benchmark_commands")
-    if found is None:
-        return None
     tables = [
         markdown(
             [f"stage of `{command}`", "processor", "share"],

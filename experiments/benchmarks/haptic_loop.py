@@ -2,13 +2,12 @@
 
     python -m experiments.benchmarks.haptic_loop [--seconds 60] [--realtime] [--output FILE.json]
 
-Rate: two blocks picked and stacked over and over at 4 kHz, every step timed on one core, memory
-watched, compared with loops at the same pace that do nothing, or arithmetic for as long as a step takes: how
-late those are, the machine is. With
-`--realtime` it runs as a haptic loop would: paced by the clock, before all other
-processes; without, as fast as it can. Passivity: a light device, squeezed onto a block by a
-spring, feels forces that are held for a period and one sample old; port energy and remaining
-motion over a range of pad stiffness, at 1 and 4 kHz, without and with passivity control, against
+Rate: two blocks are picked and stacked repeatedly at 4 kHz, with every step timed on one core and memory
+monitored, and compared with loops at the same pace that do nothing, or arithmetic for as long as a step
+takes; these show the machine's own latency. With `--realtime` it runs as a haptic loop would, paced by the
+clock and with priority over all other processes; without it, as fast as possible. Passivity: a light device,
+squeezed onto a block by a spring, feels forces that are held for a period and one sample old; port energy and
+remaining motion over a range of pad stiffness, at 1 and 4 kHz, without and with passivity control, against
 the sampled-data limit.
 """
 
@@ -26,12 +25,12 @@ from pathlib import Path
 import numpy as np
 
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.jaxconfig import configure
 from simgap.world.properties import PAPER_BLOCKS
-from simgap.world.simulate import simulate_trial
+from simgap.world.simulate import simulate_trials
 from simgap.world.virtual_model import (
     Surroundings,
     VirtualModel,
@@ -48,8 +47,8 @@ HAND_STIFFNESS, SQUEEZE = 150.0, 0.01  # N/m and m: the operator closes by 1.5 N
 
 
 def measure_rate(seconds: float, paced: bool, rate: float = 4000.0) -> dict[str, float]:
-    """Times of every step [us] of so many seconds at a rate, and what memory grew by [bytes]."""
-    done = simulate_trial(TASK, Rig(fingertip=PADS), PAPER_BLOCKS, seed=0)
+    """Times of all steps [us] over `seconds` at a rate, and the growth of memory [bytes]."""
+    done = simulate_trials(TASK, Rig(fingertip=PADS), [PAPER_BLOCKS], [0])[0]
     places = {name: float(done.motion.blocks[0, k, 0]) for k, name in enumerate(TASK.objects)}
     model = VirtualModel(Rig(fingertip=PADS), TASK, PAPER_BLOCKS, places)
     t = np.arange(0, done.t[-1], 1 / rate)
@@ -87,7 +86,7 @@ def measure_rate(seconds: float, paced: bool, rate: float = 4000.0) -> dict[str,
 
 
 def _spin(micro: float) -> Callable[[], object]:
-    """Arithmetic that touches no memory and takes about so many us of the processor."""
+    """Arithmetic without memory access that takes about the given processor time [us]."""
     work = lambda n: sum(range(n))  # noqa: E731
     began = time.thread_time_ns()
     for _ in range(1000):
@@ -116,7 +115,7 @@ def _timed(
 
 
 def _growth(model: VirtualModel, position: np.ndarray, velocity: np.ndarray, dt: float) -> int:
-    """Bytes that Python holds more after ten thousand steps than after a thousand."""
+    """Growth of Python's memory [bytes] from one thousand to ten thousand steps."""
     held = []
     tracemalloc.start()
     for k in range(11_000):
@@ -147,7 +146,7 @@ def stiffest_passive(damping: float, period: float, delay: float) -> float:
 
 
 class PassivityControl:
-    """Keeps what a virtual scene returns through the fingers below what it took.
+    """Bounds the energy that a virtual scene returns through the fingers by what it absorbed.
 
     Call `render` once a period with what the model asks for. `energy` [J] is what the scene has
     taken up through the port so far; `allowed` [J] is what it may return beyond that (what blocks
@@ -199,7 +198,7 @@ def squeeze(
     energy, returned, speeds = 0.0, 0.0, []
     for _ in range(round(seconds * rate)):
         force = model.step(place, speed, period)
-        # One sample of delay: what the model says now is rendered a period later.
+        # One sample of delay: the model's current output is rendered a period later.
         held, waiting = waiting, force
         if controlled:
             held = control.render(held, place)
@@ -226,11 +225,8 @@ def measure_passivity() -> list[dict[str, float | bool]]:
     return rows
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/virtual_model.md: the haptic loop and one that does nothing."""
-    found = load("haptic_loop")
-    if found is None:
-        return None
     rate = found["rate"]
     rows = [
         ["two blocks", f"{rate['median_us']:.0f} µs", f"{rate['p99_9_us']:.0f} µs",

@@ -3,10 +3,9 @@
     python -m experiments.benchmarks.long_recordings LAB
 
 LAB holds rig.toml and task.toml; its virtual model performs the task once at 1 kHz, and this round is
-recorded again and again. Each length and kind of
-file is written piece by piece and segmented by a process of its own, whose peak memory includes Python and
-all libraries; up to a length that memory allows, the same in one piece, with the answers compared. Writes
-experiments/results/benchmark_long.json.
+repeated. Each length and kind of file is written piece by piece and segmented in a separate process, whose
+peak memory includes Python and all libraries; where memory allows, the same is done in one piece and the
+answers compared. Writes experiments/results/benchmark_long.json.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from hmmseg.hand.read import LongRecording
 from hmmseg.io.formats import kind_of, rows_of
 from hmmseg.io.rig import Rig
@@ -52,12 +51,12 @@ def simulated(lab: Path, case: Path) -> None:
     rig = case.parent / "rig_faster.toml"
     rig.write_text(faster)
     given = ["--task", str(lab / "task.toml"), "--rig", str(rig), "--seed", str(SEED), "--output", str(case)]
-    # In a process of its own: those that are measured inherit the peak memory of this one.
+    # In a separate process: the measured ones inherit the peak memory of this one.
     subprocess.run([sys.executable, "-m", "hmmseg_cli.main", "simulate", *given, "--quiet"], check=True)
 
 
 def performed(case: Path) -> tuple[BlockTask, Rig]:
-    """The case's task, as often as it is seen, and its rig."""
+    """The case's task, repeated as often as recorded, and its rig."""
     task = Task.read(case / "task.toml")
     assert isinstance(task, BlockTask)
     return replace(task, repeat="unknown"), Rig.read(case / "rig.toml")
@@ -72,7 +71,7 @@ def rounds_of(case: Path, rig: Rig, rounds: int) -> Iterator[dict[str, np.ndarra
 
 
 def write(case: Path, rig: Rig, rounds: int, path: Path) -> None:
-    """A recording of so many rounds as Parquet or NPZ."""
+    """Write a recording of a number of rounds as Parquet or NPZ."""
     if path.suffix == ".parquet":
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -108,11 +107,8 @@ def measure(case: Path, path: Path, in_memory: bool) -> dict:
     }  # fmt: skip
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/benchmarks.md: long recordings."""
-    found = load("benchmark_long")
-    if found is None:
-        return None
     rows = [
         [f"{row['rows']:,}", row["from"], f"{row['found']} of {row['rounds']}", f"{row['processor']:.1f} s",
          f"{row['memory_mb']:.0f} MB", {True: "yes", False: "NO", None: ""}[row.get("same_answer")]]

@@ -4,8 +4,7 @@
 
 FOLDERs hold cases (rig.toml, task.toml, trial_*.csv, truth/). Writes experiments/results/watch.json and
 docs/figures/watch_lag.png. Ten minutes at 1 kHz are the fastest case's rows, performed again and again
-(`repeat`), so that the stream is as a real one is. Times are of the processor, rows parsed and lines written
-included.
+(`repeat`), as a real stream would be. Processor times include parsing rows and writing lines.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import numpy as np
 
 from experiments.recordings import list_cases, read_boundaries
 from experiments.saving import save
-from experiments.table_text import load, markdown, percent
+from experiments.table_text import markdown, percent
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import Trial
@@ -84,7 +83,8 @@ def timing(case: Path) -> dict:
 
 
 def boundaries(case: Path, file: Path, lag: float) -> tuple[list, bool, bool]:
-    """Settled boundaries (t, sd), whether a row before the end was said not to fit, and the last verdict."""
+    """Settled boundaries (t, sd), whether an earlier row was reported as not fitting, and the last
+    verdict."""
     watcher, alarm = Watcher(case / "task.toml", case / "rig.toml", lag), False
     for t, row in zip(*rows_of(case, file), strict=True):
         alarm |= not watcher.update(float(t), row).fits
@@ -95,7 +95,7 @@ def boundaries(case: Path, file: Path, lag: float) -> tuple[list, bool, bool]:
 
 
 def off_line(case: Path, file: Path) -> tuple[list, bool]:
-    """The same from the whole recording, one trial by itself."""
+    """The same from the whole recording, analysed alone."""
     from hmmseg.api import segment
 
     found = segment(file, case / "task.toml", case / "rig.toml")[0]
@@ -126,11 +126,8 @@ def summary(errors: list[tuple[float, float]]) -> dict:
     }  # fmt: skip
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/watch.md: what `make bench-watch` measured."""
-    found = load("watch")
-    if found is None:
-        return None
     time, lag, apart = found["timing"], found["by_lag"], found["apart_from_off_line"]
     rows = [
         [f"{time['rows']:,} rows at {time['rate']:.0f} Hz, processor a row, median",

@@ -1,4 +1,4 @@
-"""A sealed set: its cases, the world of each, what was done to it, its trials with their truth."""
+"""The cases of a set: their worlds, effects, trials and truth."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from experiments.blind_check.signals import (
     SCALE,
     Signals,
     Stage,
+    Values,
     noise_of_channels,
     sample,
     sense,
     task_space,
 )
-from experiments.blind_check.stages import Values
 from experiments.blind_check.worlds import Circumstances, draw_world
 
 TRIALS = 4
@@ -48,7 +48,7 @@ HOLDS = 2.2  # a block is no heavier than this times the pads' friction, N: or i
 
 @dataclass(frozen=True)
 class Case:
-    """What a case is: tier, world, blocks, and its effects' values by name, each with its size (0 to 1)."""
+    """A case: tier, world, blocks, and the values and size (0 to 1) of each effect by name."""
 
     name: str
     seed: int
@@ -75,7 +75,7 @@ class Recorded:
 
 
 def tiers(count: int, shares: Mapping[str, int] = TIERS) -> list[str]:
-    """The tier of every case: shares kept at any number, spread over the whole set."""
+    """The tier of every case: shares hold for any number of cases, spread over the whole set."""
     names, weights = list(shares), np.array(list(shares.values()), float)
     given, out = np.zeros(len(names)), []
     for k in range(count):
@@ -112,7 +112,7 @@ def draw_cases(
 def _choice(
     tier: str, rng: np.random.Generator, pools: dict[str, list[str]], outside: Mapping[str, Made]
 ) -> list[str]:
-    """Names of the effects of a case: every name of its tier once before any comes again."""
+    """Names of a case's effects: each name of its tier is used once before any repeats."""
 
     def deal(pool: str, names: Sequence[str]) -> str:
         if not pools.get(pool):
@@ -168,7 +168,7 @@ def _size(tier: str, effect: str, place: int, rng: np.random.Generator) -> float
 
 
 def draw_blocks(world: Circumstances, rng: np.random.Generator) -> dict[str, Block]:
-    """Blocks of the task: what lies below is the wider."""
+    """Blocks of the task, the lower ones wider."""
     names = sorted(world.work.on)
     widths = {"block1": (0.014, 0.02), "block2": (0.022, 0.03), "block3": (0.024, 0.032)}
     return {n: _block(rng, *widths[n]) for n in names}
@@ -190,7 +190,7 @@ def record_case(
     first: int = 0,
     outside: Mapping[str, Made] = OUTSIDE,
 ) -> list[Recorded]:
-    """The trials of a case, worked in another style if that is given; `first` numbers the first one."""
+    """The trials of a case, optionally in another style, numbered from `first`."""
     made = {**CATALOGUE, **outside}
     changes = [made[n].change(v) for n, v in case.effects.items()]
     return [_record(case, nominal, k, style or {}, changes) for k in range(first, first + TRIALS)]
@@ -200,7 +200,7 @@ def _record(
     case: Case, nominal: Rig, trial: int, asked: dict[str, tuple[float, float]], changes: Sequence[Change]
 ) -> Recorded:
     rig, healthy = case.world.rig(nominal), case.world.world()
-    # What an effect asks of the operator for its own sake (a loose grip) is done by the healthy twin too.
+    # A style that an effect requires (a loose grip) is shared by the healthy twin.
     usual = case.world.style()
     world, style, sampling = healthy, usual, case.world.sampling()
     for change in changes:

@@ -80,13 +80,13 @@ def diagnose_folder(folder: Path) -> dict[str, Any]:
 
 
 def excluded(folder: Path) -> tuple[str, ...]:
-    """Effects that the case takes out of the catalogue."""
+    """Effects removed from the catalogue for this case."""
     file = folder / "options.json"
     return tuple(json.loads(file.read_text(encoding="utf-8"))["exclude"]) if file.exists() else ()
 
 
 def _gains(found: Diagnosis) -> dict[str, float]:
-    """What each effect by itself gains over none [nats], less a nat for each of its parameters (Akaike).
+    """Gain of each single effect over none [nats], minus a nat per parameter (Akaike).
 
     Effects that only scatter have none: the scorer goes by what they move.
     """

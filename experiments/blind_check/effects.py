@@ -1,7 +1,7 @@
-"""The contract's effects, put in by MuJoCo's own means or in the recording chain, in forms of their own.
+"""The contract's effects, implemented independently: by MuJoCo's own means or in the recording chain.
 
-Every entry draws its parameters at a size (1: large) and says what it changes: the world before the
-run, stages of the recording chain, the readout's sampling. Parameters are those of the contract.
+Each entry draws the contract's parameters at a size (1: large) and states what it changes: the world before
+the run, stages of the recording chain, or the sampling.
 """
 
 from __future__ import annotations
@@ -17,18 +17,16 @@ from experiments.blind_check.scene import World
 from experiments.blind_check.signals import (
     BAND,
     ENCODER,
+    FINGERS,
+    FORCES,
     HAND,
+    JOINTS,
     LINKS,
     MIX,
     READOUT,
     SCALE,
-    Stage,
-)
-from experiments.blind_check.stages import (
-    FINGERS,
-    FORCES,
-    JOINTS,
     Rng,
+    Stage,
     Values,
     added_force,
     bumped,
@@ -49,7 +47,8 @@ from experiments.blind_check.stages import (
 
 @dataclass(frozen=True)
 class Change:
-    """What one effect does: `world` edits the world, `stages` the chain, `sampling` the readout."""
+    """What one effect changes: the `world`, `stages` of the recording chain, `sampling`, the operator's
+    `style`."""
 
     world: Callable[[World], World] | None = None
     stages: tuple[tuple[int, Stage], ...] = ()
@@ -64,12 +63,18 @@ class Made:
     name: str
     draw: Callable[[Rng, float], Values]
     change: Callable[[Values], Change]
-    scored: bool = True  # whether its parameters mean what the contract's mean
+    scored: bool = True  # whether its parameters have the contract's meaning
 
 
-def fault(name: str, draw: Callable[[Rng, float], Values], stage: int, build) -> Made:
-    """An effect in the chain of sensing alone: `build` makes of its values what happens at `stage`."""
-    return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored=False)
+def fault(
+    name: str,
+    draw: Callable[[Rng, float], Values],
+    stage: int,
+    build: Callable[[Values], Stage],
+    scored: bool = False,
+) -> Made:
+    """An effect that acts only at one `stage` of the recording chain, as `build` makes it from its values."""
+    return Made(name, draw, lambda v: Change(stages=((stage, build(v)),)), scored)
 
 
 def _sign(rng: Rng) -> float:
@@ -77,26 +82,26 @@ def _sign(rng: Rng) -> float:
 
 
 def _some(rng: Rng, names: tuple[str, ...], unit: float) -> Values:
-    """Channels of random sign and size, some of them spared, at rms `unit`."""
+    """Values of random sign and size for channels, some of them zero, with rms `unit`."""
     while True:
         x = rng.normal(size=len(names)) * (rng.random(len(names)) < 0.7)
         if np.abs(x).max() > 0.2:
             return dict(zip(names, map(float, unit * x / np.sqrt((x**2).mean())), strict=True))
 
 
-GROSS = 0.12  # share of biases that are a sensor never tared
+GROSS = 0.12  # share of biases from a sensor that was never tared
 TARE = 1.0  # N
 
 
 def _bias(rng: Rng, size: float) -> Values:
-    """Four channels' zeros, or one sensor that was never tared."""
+    """Zero errors of four channels, or of one sensor that was never tared."""
     if size > 0.3 and rng.random() < GROSS:
         return dict.fromkeys(FORCES, 0.0) | {str(rng.choice(FORCES)): TARE * _sign(rng) * rng.uniform(0.5, 2)}
     return _some(rng, FORCES, 0.16 * size)
 
 
 def _common_or_one(rng: Rng, name: str, value: float, channels: bool = False) -> Values:
-    """Of both fingers alike, as `name`, or of one finger or channel alone."""
+    """A value common to both fingers, as `name`, or of one finger or channel alone."""
     kind = rng.random()
     if kind < 0.6:
         return {name: value}
@@ -109,18 +114,16 @@ def _log(rng: Rng, low: float, high: float) -> float:
 
 
 def _pads(rng: Rng, size: float) -> Values:
-    """Stiffer or softer by up to a factor 3.5; in shear alike, or not at all. Shares of the rig's own."""
+    """Pads stiffer or softer by up to a factor of 3.5, in shear likewise or not at all; relative to the
+    rig."""
     way = _sign(rng) if size > 0.3 else -1.0
     scale = float(np.exp(way * 1.25 * size))
-    return {
-        "normal_stiffness": scale,
-        "shear_stiffness": float(rng.choice([1.0, scale])),
-        "exponent": float(rng.choice([1.0, 1.08])),
-    }
+    return {"normal_stiffness": scale, "shear_stiffness": float(rng.choice([1.0, scale])),
+            "exponent": float(rng.choice([1.0, 1.08]))}  # fmt: skip
 
 
 def fitted(name: str, values: Values, rig: Rig) -> Values:
-    """Values drawn for the nominal rig, as they are on another: pads as stiffnesses, times by its rate."""
+    """Values converted from the nominal rig to another: pads to stiffnesses, jitter by the rate."""
     out = dict(values)
     if name == "fingertip_compliance":
         out["normal_stiffness"] *= rig.normal_stiffness
@@ -131,139 +134,64 @@ def fitted(name: str, values: Values, rig: Rig) -> Values:
 
 
 def _misjudged(rng: Rng, size: float) -> Values:
-    """A property of block1 that was measured wrong, by a share of it."""
+    """A property of block1 that was measured wrong, by a share of its value."""
     return {f"block1.{rng.choice(['weight', 'width', 'height'])}": 0.15 * size * _sign(rng)}
 
 
 def _world(**names: str) -> Callable[[Values], Change]:
-    """A change of the world's fields: field = parameter."""
+    """A change of the world's fields, given as field = parameter."""
     return lambda v: Change(world=lambda w: replace(w, **{f: v[p] for f, p in names.items()}))
 
 
 MADE = (
-    Made(
-        "force_bias",
-        _bias,
-        lambda v: Change(stages=((READOUT, added_force(lambda s, r: channel_values(v, FORCES))),)),
-    ),
-    Made(
-        "force_drift",
-        lambda r, s: _some(r, FORCES, 0.025 * s),
-        lambda v: Change(stages=((READOUT, drift(v)),)),
-    ),
-    Made(
-        "force_gain",
-        lambda r, s: _common_or_one(r, "gain", 0.16 * s * _sign(r), channels=True),
-        lambda v: Change(
-            stages=((SCALE, lambda s, r: replace(s, force=s.force * (1 + by_channel(v, "gain")))),)
-        ),
-    ),
-    Made(
-        "force_crosstalk",
-        lambda r, s: {
-            "fy_from_fx": 0.09 * s * _sign(r),
-            "fx_from_fy": 0.09 * s * r.uniform(-1, 1),
-        },
-        lambda v: Change(stages=((MIX, crossed(v)),)),
-    ),
-    Made(
-        "sensor_rotation",
-        lambda r, s: {"angle1": 0.1 * s * _sign(r) * r.uniform(0.5, 1), "angle2": 0.1 * s * _sign(r)},
-        lambda v: Change(stages=((MIX, turned(v)),)),
-    ),
-    Made(
-        "force_lag",
-        lambda r, s: _common_or_one(r, "delay", 0.25 * s),
-        lambda v: Change(stages=((BAND, late(v)),)),
-    ),
-    Made(
-        "force_lowpass",
-        lambda r, s: _common_or_one(r, "time_constant", 0.2 * s),
-        lambda v: Change(stages=((BAND, smooth(v)),)),
-    ),
+    fault("force_bias", _bias, READOUT,
+          lambda v: added_force(lambda s, r: channel_values(v, FORCES)), scored=True),
+    fault("force_drift", lambda r, s: _some(r, FORCES, 0.025 * s), READOUT, drift, scored=True),
+    fault("force_gain", lambda r, s: _common_or_one(r, "gain", 0.16 * s * _sign(r), channels=True), SCALE,
+          lambda v: lambda s, r: replace(s, force=s.force * (1 + by_channel(v, "gain"))), scored=True),
+    fault("force_crosstalk",
+          lambda r, s: {"fy_from_fx": 0.09 * s * _sign(r), "fx_from_fy": 0.09 * s * r.uniform(-1, 1)},
+          MIX, crossed, scored=True),
+    fault("sensor_rotation",
+          lambda r, s: {"angle1": 0.1 * s * _sign(r) * r.uniform(0.5, 1), "angle2": 0.1 * s * _sign(r)},
+          MIX, turned, scored=True),
+    fault("force_lag", lambda r, s: _common_or_one(r, "delay", 0.25 * s), BAND, late, scored=True),
+    fault("force_lowpass", lambda r, s: _common_or_one(r, "time_constant", 0.2 * s), BAND, smooth,
+          scored=True),
     Made("quantisation", lambda r, s: {"step": 0.2 * s}, lambda v: Change(sampling={"step": v["step"]})),
-    Made(
-        "joint_offset",
-        lambda r, s: _some(r, JOINTS, 0.02 * s),
-        lambda v: Change(stages=((ENCODER, offset_joints(v)),)),
-    ),
-    Made(
-        "link_length",
-        lambda r, s: {"scale": 0.04 * s * _sign(r)},
-        lambda v: Change(stages=((LINKS, lambda s, r: replace(s, stretch=s.stretch + v["scale"])),)),
-    ),
-    Made("backlash", lambda r, s: {"width": 0.012 * s}, lambda v: Change(stages=((ENCODER, played(v)),))),
+    fault("joint_offset", lambda r, s: _some(r, JOINTS, 0.02 * s), ENCODER, offset_joints, scored=True),
+    fault("link_length", lambda r, s: {"scale": 0.04 * s * _sign(r)}, LINKS,
+          lambda v: lambda s, r: replace(s, stretch=s.stretch + v["scale"]), scored=True),
+    fault("backlash", lambda r, s: {"width": 0.012 * s}, ENCODER, played, scored=True),
     Made("clock_jitter", lambda r, s: {"sd": 0.02 * s}, lambda v: Change(sampling={"jitter": v["sd"]})),
-    Made(
-        "fingertip_compliance",
-        _pads,
-        _world(normal_stiffness="normal_stiffness", shear_stiffness="shear_stiffness", exponent="exponent"),
-    ),
-    Made(
-        "fingertip_creep",
-        lambda r, s: {"ratio": 1.2 * s, "time_constant": _log(r, 0.2, 2.0)},
-        _world(creep_ratio="ratio", creep_time="time_constant"),
-    ),
-    Made("fingertip_mass", lambda r, s: {"mass": 0.03 * s}, lambda v: Change(stages=((HAND, heavy(v)),))),
-    Made(
-        "grip_slip",
-        lambda r, s: {"mu": 0.22 + 0.13 * (1 - s) * r.uniform(0.6, 1.4)},
-        lambda v: Change(
-            world=lambda w: replace(w, pad_friction=v["mu"]),
-            style={"grip": (1.3, 1.9), "press": (0.8, 1.6)},
-        ),
-    ),
-    Made(
-        "offcentre_mass",
-        lambda r, s: {"offset": 0.005 * s * _sign(r)},
-        _world(mass_offset="offset"),
-        scored=False,  # a hand that yields under the heavier side and a grip that then pushes askew add to it
-    ),
-    Made(
-        "hand_roll",
-        lambda r, s: {"amplitude": 0.02 * s},
-        lambda v: Change(style={"roll": v["amplitude"]}),
-    ),
+    Made("fingertip_compliance", _pads,
+         _world(normal_stiffness="normal_stiffness", shear_stiffness="shear_stiffness", exponent="exponent")),
+    Made("fingertip_creep", lambda r, s: {"ratio": 1.2 * s, "time_constant": _log(r, 0.2, 2.0)},
+         _world(creep_ratio="ratio", creep_time="time_constant")),
+    fault("fingertip_mass", lambda r, s: {"mass": 0.03 * s}, HAND, heavy, scored=True),
+    Made("grip_slip", lambda r, s: {"mu": 0.22 + 0.13 * (1 - s) * r.uniform(0.6, 1.4)},
+         lambda v: Change(world=lambda w: replace(w, pad_friction=v["mu"]),
+                          style={"grip": (1.3, 1.9), "press": (0.8, 1.6)})),
+    # Not scored: a hand that yields under the heavier side, and a grip that then pushes askew, add to it.
+    Made("offcentre_mass", lambda r, s: {"offset": 0.005 * s * _sign(r)}, _world(mass_offset="offset"),
+         scored=False),
+    Made("hand_roll", lambda r, s: {"amplitude": 0.02 * s},
+         lambda v: Change(style={"roll": v["amplitude"]})),
     Made("actual", _misjudged, lambda v: Change()),
     Made("table_tilt", lambda r, s: {"angle": 0.04 * s * _sign(r)}, _world(tilt="angle")),
-    Made(
-        "table_compliance",
-        lambda r, s: {"stiffness": 700.0 / s},
-        _world(table_stiffness="stiffness"),
-    ),
-    Made(
-        "cable_force",
-        lambda r, s: {
-            "stiffness": 4.0 * s * _sign(r),
-            "x0": r.uniform(0.08, 0.2),
-            "y0": r.uniform(-0.02, 0.1),
-        },
-        lambda v: Change(
-            world=lambda w: replace(w, cable=(v["stiffness"], v["x0"], v["y0"])),
-            stages=((HAND, pulled(v)),),
-        ),
-    ),
-    Made(
-        "viscous_drag",
-        lambda r, s: {"coefficient": 1.8 * s},
-        lambda v: Change(
-            world=lambda w: replace(w, drag=v["coefficient"]),
-            stages=((HAND, added_force(lambda s, r: v["coefficient"] * s.motion.velocity)),),
-        ),
-    ),
-    Made(
-        "structural_vibration",
-        lambda r, s: {
-            "frequency": r.uniform(2.5, 14.0),
-            "damping": _log(r, 0.015, 0.12),
-            "coupling": 0.3 * s,
-        },
-        lambda v: Change(stages=((MIX, ringing(v)),)),
-    ),
-    Made(
-        "contact_impact",
-        lambda r, s: {"impulse": 0.08 * s, "length": _log(r, 0.03, 0.08)},
-        lambda v: Change(stages=((HAND, bumped(v)),)),
-    ),
-)
+    Made("table_compliance", lambda r, s: {"stiffness": 700.0 / s}, _world(table_stiffness="stiffness")),
+    Made("cable_force",
+         lambda r, s: {"stiffness": 4.0 * s * _sign(r), "x0": r.uniform(0.08, 0.2), "y0": r.uniform(-0.02,
+             0.1)},
+         lambda v: Change(world=lambda w: replace(w, cable=(v["stiffness"], v["x0"], v["y0"])),
+                          stages=((HAND, pulled(v)),))),
+    Made("viscous_drag", lambda r, s: {"coefficient": 1.8 * s},
+         lambda v: Change(world=lambda w: replace(w, drag=v["coefficient"]),
+                          stages=((HAND, added_force(lambda s, r: v["coefficient"] * s.motion.velocity)),))),
+    fault("structural_vibration",
+          lambda r, s: {"frequency": r.uniform(2.5, 14.0), "damping": _log(r, 0.015, 0.12),
+                        "coupling": 0.3 * s}, MIX, ringing, scored=True),
+    fault("contact_impact", lambda r, s: {"impulse": 0.08 * s, "length": _log(r, 0.03, 0.08)}, HAND, bumped,
+          scored=True),
+)  # fmt: skip
 CATALOGUE = {made.name: made for made in MADE}

@@ -99,7 +99,7 @@ def _open_label(case: Case) -> dict:
 
 
 def outside_of(file: Path | None) -> Mapping[str, Made]:
-    """OUTSIDE of a Python file that is kept apart until its set is scored, or the kinds known so far."""
+    """OUTSIDE of a Python file that is withheld until its set is scored, or the known kinds."""
     if file is None:
         return OUTSIDE
     spec = importlib.util.spec_from_file_location("unseen", file)
@@ -133,7 +133,7 @@ def _rounded(table: dict[str, list[float]]) -> dict[str, list[float]]:
 
 
 def write_folder(folder: Path, case: Case, trials: list[Recorded], nominal: Rig) -> None:
-    """What a user has: rig, task, trials, and actual.toml where the blocks were measured."""
+    """Write a user's folder: rig, task, trials, and actual.toml if the blocks were measured."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "rig.toml").write_text(rig_toml(case, nominal), encoding="utf-8")
     (folder / "task.toml").write_text(case.world.work.toml(), encoding="utf-8")
@@ -165,7 +165,7 @@ def rig_toml(case: Case, nominal: Rig) -> str:
 
 
 def csv(times: np.ndarray, columns: Mapping[str, np.ndarray]) -> str:
-    """A trial's file; digits lie far below the noise: 1e-6 rad, 1e-4 rad/s, 1e-5 N, 1e-5 s."""
+    """A trial as CSV, rounded far below the noise: 1e-6 rad, 1e-4 rad/s, 1e-5 N, 1e-5 s."""
     digits = {n: 6 if n.startswith("q") else 4 if n.startswith("d") else 5 for n in columns}
     lines = [",".join(["t", *columns])]
     for k, t in enumerate(times):

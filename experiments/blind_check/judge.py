@@ -1,4 +1,4 @@
-"""One case judged: what is true of it, what was said, whether that is right."""
+"""Judge a case: its truth, its diagnosis, and whether that is right."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from experiments.blind_check.effects import CATALOGUE
 FLOOR = 5.0  # nats that an effect gains, its parameters paid for
 AFFECTED = 3.0  # standard deviations of a sample
 VISIBLE = 1.0  # the same, rms over a cell, of an effect that is not fitted
-# What these recordings cannot tell from a withheld effect (gap-effects.md; * only without actual.toml).
+# Effects indistinguishable from a withheld one in these recordings (* only without actual.toml).
 PARTNERS = {
     "force_gain": ("fingertip_compliance*",),
     "fingertip_compliance": ("force_gain*",),
@@ -21,22 +21,13 @@ HEALTHY = ("healthy", "slight")
 HONEST = 0.3  # remainder beyond which a named cause does not hide an effect from outside
 # A diagnosis that ended in an error.
 NOTHING: dict[str, Any] = {
-    "verdict": "error",
-    "causes": [],
-    "indistinguishable": [],
-    "probabilities": {},
-    "attribution": {},
-    "where": [],
-    "effects": {},
-    "shrinkage": None,
-    "remainder": None,
-    "bic": "error",
-    "gains": {},
-}
+    "verdict": "error", "causes": [], "indistinguishable": [], "probabilities": {}, "attribution": {},
+    "where": [], "effects": {}, "shrinkage": None, "remainder": None, "bic": "error", "gains": {},
+}  # fmt: skip
 
 
 def label(entry: dict[str, Any]) -> str:
-    """The probability's name that ought to be large."""
+    """Name of the probability that should be largest."""
     if entry["tier"] in ("healthy", "slight"):
         return "none"
     if entry["tier"] in ("outside", "withheld"):
@@ -45,9 +36,11 @@ def label(entry: dict[str, Any]) -> str:
 
 
 def partners(entry: dict[str, Any]) -> set[str]:
-    """Effects of the catalogue whose set with the withheld one is a right answer."""
-    (name,) = entry["effects"]
-    given = PARTNERS.get(name, ())
+    """Effects of the catalogue whose set with the withheld one is a right answer; none for several
+    effects."""
+    given = (
+        [p for name in entry["effects"] for p in PARTNERS.get(name, ())] if len(entry["effects"]) == 1 else []
+    )
     return {p.rstrip("*") for p in given if not (p.endswith("*") and entry["measured"])}
 
 
@@ -89,7 +82,7 @@ def true_parameters(entry: dict[str, Any]) -> dict[str, float]:
 
 
 def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
-    """A row of the results: the tables are made of rows alone."""
+    """The results' row for a case; tables are made from rows only."""
     failed = "error" in found
     if failed:
         found = {**NOTHING, "seconds": found["seconds"], "error": found["error"]}
@@ -123,7 +116,7 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
     if tier == "outside":
         row["right"] = found["verdict"] == "unknown" or (rest is not None and rest > HONEST)
     if tier == "withheld":
-        shared = bool(together & _stand_ins(entry, found)) and len(said) == 1
+        shared = bool(together & partners(entry)) and len(said) == 1
         row["right"] = found["verdict"] == "unknown" or shared or (rest is not None and rest > HONEST)
     if tier == "dense":
         row["dominant"] = bool(true) and max(entry["sizes"], key=lambda k: entry["sizes"][k]) in said
@@ -133,36 +126,31 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _gain(entry: dict, found: dict) -> float | None:
-    """Nats that the true effects by themselves gain, the least of them; None where it was not fitted."""
+    """Smallest gain [nats] of the true effects, each alone; None if one was not fitted."""
     known = [found["gains"].get(n) for n in entry["effects"]]
     return None if not known or None in known else float(min(known))  # type: ignore[type-var]
 
 
 def _above(entry: dict, found: dict) -> bool:
-    """Whether each true effect can be seen: by what it gains, else by what it shifts."""
+    """Whether each true effect is detectable: by its gain if fitted, else by its shift."""
     gain = _gain(entry, found)
     return visible(entry) if gain is None else gain >= FLOOR
 
 
-def _stand_ins(entry: dict, found: dict) -> set[str]:
-    """Effects that may stand for a withheld one."""
-    return partners(entry) if len(entry["effects"]) == 1 else set()
-
-
 def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
-    """Largest probability and whether it lies on what is true."""
+    """The largest probability, and whether it belongs to the truth."""
     known = {k: v for k, v in found["probabilities"].items() if k != "other"}
     if not known:
         return None
     name = max(known, key=lambda k: known[k])
     right = name == label(entry)
     if entry["tier"] == "withheld":
-        right = right or name in _stand_ins(entry, found)
+        right = right or name in partners(entry)
     return float(known[name]), right
 
 
 def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
-    """Probability that each effect acts, and whether it does; of outside cases nothing is known."""
+    """Probability that each effect acts, and whether it does; empty for outside cases."""
     if entry["tier"] in ("outside", "withheld"):
         return []
     acting = found.get("attribution") or {}
@@ -170,7 +158,7 @@ def _inclusion(entry: dict, found: dict) -> list[tuple[float, bool]]:
 
 
 def intervals_hold(entry: dict, found: dict) -> dict[str, bool]:
-    """Whether the 90 % interval of each true effect's parameter holds its value, where it was named."""
+    """Whether the 90 % interval of each parameter of the named true effects contains its value."""
     got = {}
     for name in found["causes"]:
         for key in (name, "+".join(sorted(found["causes"]))):

@@ -1,22 +1,76 @@
-"""A person's paths for any task of blocks, as knots that motions of some profile join.
+"""A person's paths for any task of blocks: knots joined by motions of a given profile.
 
 Every length, duration and force is drawn for each trial; profile and servo are the lab's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.blind_check.profiles import PROFILES, Profile
-from experiments.blind_check.scene import PAD, PIVOT, STEP, TIP, Block, Servo, World
-from experiments.blind_check.tasks import GROUND, Task
+from experiments.blind_check.scene import GROUND, PAD, PIVOT, STEP, TIP, Block, Servo, Task, World
 
-CLEAR = 0.016  # m between a carried block and what it passes over
-CLEARANCE = 0.001  # m between pads and what the block that they hold stands on
-OPEN = (0.010, 0.013)  # m that fingers are opened wider than a block
+# Profiles: share of the way (0 to 1) over share of the time.
+
+Profile = Callable[[np.ndarray], np.ndarray]
+
+
+def minimum_jerk(rng: np.random.Generator) -> Profile:
+    """Flash & Hogan, J. Neurosci. 5, 1985."""
+    return _quintic
+
+
+def _quintic(s: np.ndarray) -> np.ndarray:
+    s = np.clip(s, 0, 1)
+    return ((6 * s - 15) * s + 10) * s**3
+
+
+def trapezoid(rng: np.random.Generator) -> Profile:
+    """A machine's profile: constant acceleration, plateau and constant deceleration, of unequal shares."""
+    rise, fall = rng.uniform(0.15, 0.4, 2)
+    top = 1 / (1 - (rise + fall) / 2)
+
+    def way(s: np.ndarray) -> np.ndarray:
+        s = np.clip(s, 0, 1)
+        up = top * s**2 / (2 * rise)
+        along = top * (s - rise / 2)
+        down = 1 - top * (1 - s) ** 2 / (2 * fall)
+        return np.where(s < rise, up, np.where(s < 1 - fall, along, down))
+
+    return way
+
+
+def person(rng: np.random.Generator) -> Profile:
+    """A person's profile, skewed towards the start, with a later correction of the first motion's error.
+
+    A lognormal speed (Plamondon, Biol. Cybern. 72, 1995) drawn to its end by a minimum-jerk correction
+    (Flash & Henis, J. Cogn. Neurosci. 3, 1991).
+    """
+    skew, reach = rng.uniform(0.15, 0.45), rng.uniform(0.9, 1.03)
+    late, lasting = rng.uniform(0.4, 0.55), rng.uniform(0.4, 0.45)
+
+    def way(s: np.ndarray) -> np.ndarray:
+        s = np.clip(s, 0, 1)
+        first = _quintic(s ** (1 - skew / 2) / 0.9)
+        return reach * first + (1 - reach) * _quintic((s - late) / lasting)
+
+    return way
+
+
+PROFILES: dict[str, Callable[[np.random.Generator], Profile]] = {
+    "minimum_jerk": minimum_jerk,
+    "trapezoid": trapezoid,
+    "person": person,
+}
+
+
+# Plans.
+
+CLEAR = 0.016  # m; between a carried block and what it passes over
+CLEARANCE = 0.001  # m; between pads and the support of the block they hold
+OPEN = (0.010, 0.013)  # m; opening of the fingers in excess of a block
 
 
 @dataclass(frozen=True)
@@ -78,7 +132,7 @@ class Knots:
         self.now = start + duration
 
     def add(self, name: str, start: float, duration: float, target: float) -> None:
-        """One coordinate's motion at a time of its own."""
+        """Add a motion of one coordinate at a given time."""
         self.parts.append((name, start, duration, self.value[name], target))
         self.value[name] = target
 
@@ -112,14 +166,8 @@ def plan(
     first = task.moves[0][0]
     x, top = centres[first][0], centres[first][1] + blocks[first].height / 2
     half = (blocks[first].width + u(*OPEN)) / 2
-    k = Knots(
-        PROFILES[style.profile](rng),
-        rng,
-        x=x + u(-0.015, 0.02),
-        y=top + u(0.012, 0.02),
-        left=half,
-        right=half,
-    )
+    profile = PROFILES[style.profile](rng)
+    k = Knots(profile, rng, x=x + u(-0.015, 0.02), y=top + u(0.012, 0.02), left=half, right=half)
     k.wait(u(*style.rest) / pace)
     for block, to in task.moves:
         start = yard.centres[block]
@@ -139,7 +187,7 @@ def plan(
 
 
 class _Yard:
-    """Where blocks stand now: spots on the ground, and the heights of what stands on them."""
+    """Current places of the blocks: spots on the ground, and heights."""
 
     def __init__(self, task: Task, blocks: Mapping[str, Block], slope: float, mirrored: bool, rng) -> None:
         u, widest = rng.uniform, sorted(b.width for b in blocks.values())
@@ -166,7 +214,7 @@ class _Yard:
         return 0 if self.on[block] == GROUND else 1 + self._level(self.on[block])
 
     def _face(self, block: str, x: float) -> float:
-        """Height of what `block` stands on at x."""
+        """Height of the support of `block` at x."""
         below = self.on[block]
         if below == GROUND:
             return self.slope * (x - PIVOT)
@@ -176,7 +224,7 @@ class _Yard:
         return self.x[block], self._face(block, self.x[block]) + self.blocks[block].height / 2
 
     def put(self, block: str, to: str) -> tuple[tuple[float, float], float]:
-        """Put the block there: its new centre, and the height of all that it passes."""
+        """Put a block on `to`; its new centre, and the height of everything it passes."""
         others = [self._face(b, self.x[b]) + self.blocks[b].height for b in self.on if b != block]
         self.on[block] = to
         if to == GROUND:
@@ -193,9 +241,9 @@ def _servo(stiffness: float, mass: float, ratio: float) -> Servo:
 
 def _move(k: Knots, block: Block, start, end, top: float, world: World, stiffness: float, style: Style,
           pace: float) -> None:  # fmt: skip
-    """One block from centre `start` to centre `end` past anything up to `top` [m]."""
+    """Move a block from centre `start` to centre `end` [m], over anything up to `top` [m]."""
     u = k.rng.uniform
-    # Pads keep clear of what the block stands on, also where they are sheared as it is pressed down.
+    # Pads clear the block's support even when sheared by pressing it down.
     lowest = PAD + TIP + CLEARANCE + style.press[1] / 2 / world.shear_stiffness - block.height / 2
     grasp = max(u(*style.height), lowest)
     over = max(top + block.height / 2 + CLEAR, k.value["y"])
@@ -222,7 +270,7 @@ def _move(k: Knots, block: Block, start, end, top: float, world: World, stiffnes
     touch = end[1] + grasp + sag
     k.to(u(0.4, 0.5) / pace, early=u(0.0, 0.05) / pace, y=touch + 0.0025)
     pressing = (u(*style.press) + block.weight) / 2 * (1 / stiffness + 1 / world.shear_stiffness)
-    # No stop at the surface: a hand goes on until it feels the resistance it expects.
+    # No stop at the surface: a hand moves on until it feels the expected resistance.
     k.to(u(0.36, 0.48) / pace, y=touch - pressing)
     k.wait(u(*style.place) / pace)
     k.held.append((closed, k.now))
@@ -232,7 +280,7 @@ def _move(k: Knots, block: Block, start, end, top: float, world: World, stiffnes
 
 
 def _rolled(k: Knots, t: np.ndarray, size: float, rng: np.random.Generator) -> np.ndarray:
-    """Roll (n,) [rad] of the hand while it carries, rms `size`; none as it grips and lets go."""
+    """Roll (n,) [rad] of the hand while it carries, of rms `size`; none during grip and release."""
     if not size:
         return np.zeros_like(t)
     out, weight = _shake(t, 0.3, 1.2, 1.0, rng), np.zeros_like(t)

@@ -1,4 +1,4 @@
-"""Effects that no catalogue of the contract lists; each is something that happens to real rigs.
+"""Effects outside the contract's catalogue; each occurs on real rigs.
 
 They were drawn in sets whose answers are out. A set that is to judge effects first seen takes them from a
 file that is kept apart (`--outside FILE.py`). The 34 other kinds of earlier sets stand in commit f82105c.
@@ -13,8 +13,18 @@ from scipy.signal import lfilter
 
 from experiments.blind_check.effects import _sign, fault
 from experiments.blind_check.hand import angles, jacobians
-from experiments.blind_check.signals import ENCODER, HAND, LINKS, READOUT, SCALE, Signals, Stage
-from experiments.blind_check.stages import Rng, Values, added_force
+from experiments.blind_check.signals import (
+    ENCODER,
+    HAND,
+    LINKS,
+    READOUT,
+    SCALE,
+    Rng,
+    Signals,
+    Stage,
+    Values,
+    added_force,
+)
 
 
 def _smooth(x: np.ndarray, s: Signals, time: float) -> np.ndarray:
@@ -24,7 +34,7 @@ def _smooth(x: np.ndarray, s: Signals, time: float) -> np.ndarray:
 
 
 def _seen(s: Signals, change: np.ndarray) -> Signals:
-    """Tips that were elsewhere than the encoders tell."""
+    """Move the true tips away from where the encoders show them."""
     place, rate = s.motion.position + change, s.motion.velocity + np.gradient(change, s.t, axis=0)
     return replace(s, motion=replace(s.motion, position=place, velocity=rate))
 
@@ -44,7 +54,7 @@ def lazy(v: Values) -> Stage:
 
 
 def hum(v: Values) -> Stage:
-    """Mains: all force channels, with a phase of its own in each trial."""
+    """Mains hum on all force channels, with a random phase in each trial."""
 
     def shift(s: Signals, rng: Rng) -> np.ndarray:
         phase = rng.uniform(0, 2 * np.pi)
@@ -100,7 +110,7 @@ def wandering(v: Values) -> Stage:
 
 
 def behind(v: Values) -> Stage:
-    """Two boards polled in turn: all that the second finger's says is older than its time stamp."""
+    """Two boards polled in turn: the second finger's data are older than their time stamps."""
 
     def stage(s: Signals, rng: Rng) -> Signals:
         assert s.q is not None and s.dq is not None
@@ -172,7 +182,7 @@ def loosened(v: Values) -> Stage:
 
 
 def magnet(v: Values) -> Stage:
-    """The table draws the fingertips down the more the nearer they are."""
+    """The table attracts the fingertips, more strongly the nearer they are."""
 
     def shift(s: Signals, rng: Rng) -> np.ndarray:
         return np.array([0, 1, 0, 1]) * v["pull"] * np.exp(-s.motion.position[:, [1, 1, 3, 3]] / v["reach"])

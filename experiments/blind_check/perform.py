@@ -1,4 +1,4 @@
-"""One trial run in MuJoCo: what the tips do and feel, at 1 kHz and free of noise."""
+"""One trial run in MuJoCo: noise-free motion and forces of the tips at 1 kHz."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from experiments.blind_check.scene import DAMPING, STEP, TIP_MASS, Block, World,
 EVERY = round(0.001 / STEP)  # steps a millisecond
 SETTLE = 0.15  # s that the servos stand still before the trial
 FELT = 2e-3  # N, contact
-mujoco.set_mju_user_warning(lambda text: None)  # a line search that gives up tells standard output so
+mujoco.set_mju_user_warning(lambda text: None)  # it reports failed line searches on standard output
 GAP = 30  # ms: a shock may lift a pad for less
 LIFT = 0.003  # m
 BOUNCE = 300  # ms after a release in which a finger may bounce
@@ -38,7 +38,7 @@ class Motion:
 
 
 def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
-    """Run a plan. ValueError where a grip never comes about or a block is lost."""
+    """Run a plan; ValueError if a grip fails or a block is lost."""
     text = mjcf(blocks, plan.centres, tuple(plan.command[0]), world, plan.servos)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -50,7 +50,7 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
     turns = [at[f"turn_{n}"] for n in names]
     turning = [at["r1"], at["r2"]]
     data.qpos[fingers] = plan.command[0]
-    data.qpos[turns] = world.tilt  # what stands on a slope stands inclined
+    data.qpos[turns] = world.tilt  # blocks on a slope are inclined
     command, roll = plan.command[::EVERY], plan.roll[::EVERY]
     rows, law = len(command), _PadLaw(world)
     bears = _bearings(model, names)
@@ -89,7 +89,7 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
 
 
 def _bearings(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
-    """For two geoms in contact, which block stands on the other there; -1: none does."""
+    """For each pair of geoms, the block that stands on the other there, or -1."""
     out = np.full((model.ngeom, model.ngeom), -1)
     geoms = {model.geom(i).name: i for i in range(model.ngeom)}
     for k, name in enumerate(names):
@@ -105,7 +105,7 @@ def _bearings(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
 
 
 class _PadLaw:
-    """What a pad adds to its linear spring: a Maxwell arm, or a whole power law instead of the spring.
+    """A pad's force beyond its linear spring: a Maxwell arm, or a power law in place of the spring.
 
     The law with exponent p has the nominal stiffness as secant at the reference force.
     """
@@ -119,7 +119,7 @@ class _PadLaw:
         self.fade = np.exp(-STEP / world.creep_time)
 
     def push(self, data: mujoco.MjData, pads: list[int]) -> None:
-        """Apply the forces on the tips [N] for where they are."""
+        """Apply the forces on the tips [N] for their positions."""
         if not self.needed:
             return
         place, out = data.qpos[pads], np.zeros(4)
@@ -159,7 +159,7 @@ def _boundaries(
 
 
 def _filled(what: np.ndarray) -> np.ndarray:
-    """Without interruptions shorter than GAP."""
+    """Fill interruptions shorter than GAP."""
     out = what.copy()
     ends = np.flatnonzero(np.diff(np.concatenate([[1], what.astype(int), [1]])))
     for begin, end in ends.reshape(-1, 2):
@@ -184,7 +184,7 @@ def _last(what: np.ndarray, start: int, end: int) -> int:
 
 
 def _lifted(stands: np.ndarray, touching: np.ndarray, height: np.ndarray, start: int) -> int:
-    """A sample of the flight: held, off the support and above it by more than tremor makes.
+    """A sample of the flight: held, off the support, and above it by more than tremor.
 
     A hand that wanders may lift a gripped block by a hair and set it down again before it carries it.
     """

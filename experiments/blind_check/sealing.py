@@ -12,7 +12,7 @@ JUDGED = ("hmmseg", "estimation", "simgap")
 
 
 class BrokenSeal(ValueError):
-    """Labels that are not those that were sealed."""
+    """The labels differ from those that were sealed."""
 
 
 def digest(labels: dict[str, Any], salt: str) -> str:
@@ -34,7 +34,7 @@ def seal(folder: Path, labels: dict[str, Any], salt: str) -> str:
 
 
 def unseal(folder: Path) -> dict[str, Any]:
-    """The labels; BrokenSeal where they are not what the hash was published for."""
+    """The labels; BrokenSeal if they do not match the published hash."""
     labels = json.loads((folder / "sealed" / "labels.json").read_text(encoding="utf-8"))
     salt = (folder / "sealed" / "salt").read_text(encoding="utf-8").strip()
     stated = json.loads((folder / "seal.json").read_text(encoding="utf-8"))["sha256"]

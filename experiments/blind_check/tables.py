@@ -79,7 +79,7 @@ def everything(found: dict[str, Any]) -> str:
 
 
 def fresh() -> dict[str, Any] | None:
-    """The last blind check, unless its set is one of those that judge nothing any more."""
+    """The last blind check, or None if its set has been spent."""
     found, spent = load("blind_check"), load("blind_sets")
     if found is None or found["seal"]["sha256"] in {one["seal"] for one in (spent or {"sets": []})["sets"]}:
         return None
@@ -99,7 +99,7 @@ def by_circumstance() -> str | None:
 
 
 def describe() -> str:
-    """docs/results.md: the blind check in a few sentences; nothing where it is spent."""
+    """docs/results.md: the blind check in a few sentences; "" if its set is spent."""
     found = fresh()
     if found is None:
         return ""

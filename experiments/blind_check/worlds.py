@@ -1,4 +1,4 @@
-"""Worlds: drawn circumstances under which a healthy recording is made, as labs differ.
+"""Worlds: circumstances of healthy recordings, drawn as labs differ.
 
 Rates, paces, pads, sensors (better, worse and coloured otherwise than stated), operators, servos, feet of
 blocks, pads that turn, fingers that close one after the other, small errors within what the rig states
@@ -14,9 +14,8 @@ import numpy as np
 
 from experiments.blind_check.hand import Rig
 from experiments.blind_check.operator import Style
-from experiments.blind_check.scene import FEET, World
+from experiments.blind_check.scene import FEET, TASKS, Task, World
 from experiments.blind_check.signals import Sampling
-from experiments.blind_check.tasks import TASKS, Task
 
 RATES = (20.0, 20.0, 20.0, 50.0, 50.0, 100.0, 100.0, 200.0, 500.0)  # Hz, as often as listed
 # What a rig that states anything states, as standard deviations (shares but for N and rad).
@@ -51,7 +50,7 @@ class Circumstances:
     mirrored: bool = False
 
     def rig(self, nominal: Rig) -> Rig:
-        """The rig that is stated."""
+        """The rig as stated."""
         return replace(
             nominal, rate=self.rate, normal_stiffness=self.normal_stiffness,
             shear_stiffness=self.shear_stiffness, angle_noise=nominal.angle_noise * self.sensors,
@@ -59,13 +58,13 @@ class Circumstances:
         )  # fmt: skip
 
     def velocity_noise(self, nominal: Rig) -> float:
-        """Stated noise of rates [rad/s]; of differences it is what their angles' makes of them."""
+        """Stated noise of rates [rad/s]; for differences, the one propagated from the angles."""
         if self.differences:
             return float(np.sqrt(2) * nominal.angle_noise * self.sensors * self.rate)
         return nominal.velocity_noise * self.sensors
 
     def world(self) -> World:
-        """What is true of pads and blocks."""
+        """The true pads and blocks."""
         return World(
             self.normal_stiffness, self.shear_stiffness,
             uneven=tuple(self.errors.get("pad_stiffness", (0.0, 0.0))),  # type: ignore[arg-type]
@@ -73,7 +72,7 @@ class Circumstances:
         )  # fmt: skip
 
     def style(self) -> Style:
-        """How it is worked."""
+        """The operator's style."""
         p, s = self.pace, self.servo
         return Style(
             pace=(0.93 * p, 1.08 * p), stagger=(0.5 * self.stagger, self.stagger), profile=self.profile,
@@ -81,7 +80,7 @@ class Circumstances:
         )  # fmt: skip
 
     def sampling(self) -> Sampling:
-        """How it is read."""
+        """The sampling."""
         return Sampling(noise=self.noise, colour=self.colour, differences=self.differences)
 
     @property
@@ -112,7 +111,7 @@ def _third(value: float, low: float, high: float) -> str:
 
 
 def draw_world(rng: np.random.Generator, fastest: float = float("inf")) -> Circumstances:
-    """A lab: all circumstances drawn, most of them a little, some far off; rates up to `fastest` [Hz]."""
+    """Draw a lab: most circumstances differ a little, some a lot; rates are at most `fastest` [Hz]."""
     u = rng.uniform
     pads = _log(rng, 2000, 8000)
     common = u(0.8, 1.3)
@@ -132,7 +131,7 @@ def draw_world(rng: np.random.Generator, fastest: float = float("inf")) -> Circu
 
 
 def world_of(label: dict) -> Circumstances:
-    """The world that a label tells."""
+    """The world described by a label."""
     table = label["world"]
     return Circumstances(**table | {"noise": tuple(table["noise"])})
 

@@ -11,18 +11,7 @@ import time
 
 from rich.console import Console
 
-SCRIPTS = (
-    "tables",
-    "states",
-    "recording",
-    "estimates",
-    "rigid",
-    "slip",
-    "replay",
-    "virtual_block",
-    "alike",
-    "paper_gap",
-)
+SCRIPTS = ("tables", "recording", "estimates", "rigid", "slip", "virtual_block", "alike", "paper_gap")
 
 
 def main() -> None:

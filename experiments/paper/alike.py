@@ -1,4 +1,4 @@
-"""Do simulated trials segment and identify as recordings do? Each trial alone, three sets of blocks.
+"""Whether simulated trials are segmented and identified as well as recordings, trial by trial.
 
 python -m experiments.paper.alike
 """
@@ -19,14 +19,14 @@ HEALTHY = ("paper_blocks", "none_1", "none_2")
 
 
 def coverage(share: float, count: int, nominal: float) -> dict:
-    """Share covered, and the 95 % interval (Clopper and Pearson) that should hold the nominal one."""
+    """Share covered with its 95 % interval (Clopper and Pearson), which should contain the nominal share."""
     low, high = binomtest(round(share * count), count).proportion_ci(0.95)
     return {"share": share, "count": count, "nominal": nominal, "interval_95": [low, high],
             "holds": bool(low <= nominal <= high)}  # fmt: skip
 
 
 def scored(read: Callable[[str], Case], method: Method) -> dict:
-    """Boundaries, states and properties of all healthy cases, every trial by itself."""
+    """Scores of boundaries, states and properties in all healthy cases, each trial alone."""
     scores = [score_case(read(name), method, 1, 0) for name in HEALTHY]
     found = summarise(scores)
     trials = [s["trials"] for s in scores]

@@ -1,4 +1,4 @@
-"""The paper's height of block 1, 1.5 mm long: how much slip in the grip that takes, and of which sign.
+"""Slip in the grip that would explain the paper's height of block 1, which is 1.5 mm too large.
 
     python -m experiments.paper.slip
 
@@ -39,7 +39,7 @@ GRIP = 2.5  # N, as recorded
 RISE, OPENING = 0.035, 0.012  # m
 CLOSE, LIFT, TRAVEL, LOWER, LOAD, OPEN = 0.5, 1.2, 1.7, 2.4, 3.0, 3.6  # s, when each motion begins
 DURATION = 4.2  # s
-PASSES = 5  # until the fingers know where the sliding block will touch down
+PASSES = 5  # iterations to find where the sliding block will touch down
 LIGHT = 1e-4  # m beyond the touch: the fingers rest the block's weight and press by half a newton
 # Friction over what a hanging block needs, 2 mu N / weight.
 HOLDING = np.concatenate([np.linspace(1.105, 1.145, 9), [1.16, 1.2, 1.3]])
@@ -166,7 +166,7 @@ def heights(case: Case) -> dict:
 
 
 def bounds(case: Case, needed: float) -> dict:
-    """What friction says against it: grips [N] at which block 2 could slide by the paper's bound."""
+    """Evidence from friction against slip: grips [N] below which block 2 could slide by the paper's bound."""
     mu, weight = PRINTED["block2"]["friction"], case.blocks["block2"]["weight"][0]
     return {"needed_friction": needed, "paper_bound": mu, "grip": GRIP, "impact": IMPACT,
             "grip_by_weight": weight / (2 * mu), "grip_by_impact": IMPACT / (2 * mu)}  # fmt: skip

@@ -1,4 +1,7 @@
-"""Figures 11 to 14: the calibrated virtual block 2 picked up and placed twice, and the recording.
+"""The calibrated virtual model: recordings replayed, and block 2 picked up and placed twice (Figures 11-14).
+
+A replay takes only the finger motions and the properties identified from the recordings; the true boundaries
+serve to score it by subtask.
 
 python -m experiments.paper.virtual_block
 """
@@ -7,18 +10,54 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimation.identification import Identification
 from experiments.paper.estimates import identified
-from experiments.paper.replay import calibrated
 from experiments.paper.sources import ONE, qualitative, recorded, save
+from experiments.recordings import Case
+from hmmseg.contact.decompose import subtasks
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.segmentation.thresholds import label_states, segment_qualitative
-from simgap.world.simulate import simulate_trial
+from simgap.world.properties import UNITS, Block, Blocks
+from simgap.world.replay import replay, residual_summary
+from simgap.world.simulate import simulate_trials
 
 TWICE = BlockTask({"block2": GROUND}, (Move("block2", GROUND), Move("block2", GROUND)))
 SEED = 0
 FRAMES = (0.3, 0.5, 0.7)  # of the first carry, for the picture of the virtual scene
+
+
+LIMIT = 1.5  # times the sensors' noise, in free motion and carry
+
+
+def calibrated(found: Identification) -> Blocks:
+    """Blocks of the virtual model from posterior means; friction only where slip shows it."""
+    return {name: Block(**{key: float(found.of(name, key).mean()) for key in UNITS})
+            for name in found.task.objects}  # fmt: skip
+
+
+def save_replays(case: Case, blocks: Blocks) -> None:
+    """Save residuals by contact state of every trial, and the forces of one trial."""
+    states = [step.state for step in subtasks(case.task)]
+    rows, shown = [], None
+    for i, (trial, truth) in enumerate(zip(case.trials, case.truth, strict=True)):
+        played = replay(trial, case.task, case.rig, blocks)
+        rows.append({"file": trial.name} | residual_summary(played, truth, states))
+        if i == ONE:
+            shown = played
+    assert shown is not None
+    edges = [span.start for span in identified(case).segmentations[ONE].spans[1:]]
+    save("replay", {
+        "limit": LIMIT, "trials": rows, "file": case.trials[ONE].name, "t": shown.signals.t,
+        "boundaries": edges, "states": states,
+        "measured": {"fx": shown.measured[..., 0].sum(axis=1), "fy": shown.measured[..., 1].sum(axis=1),
+                     "grip": np.minimum(shown.measured[:, 0, 0], -shown.measured[:, 1, 0])},
+        "predicted": {"fx": shown.force[..., 0].sum(axis=1), "fy": shown.force[..., 1].sum(axis=1),
+                      "grip": np.minimum(shown.force[:, 0, 0], -shown.force[:, 1, 0])},
+        "sd_net": float(np.sqrt(2) * shown.signals.sd_force),
+        "sd_height": float(np.nanmedian(shown.signals.sd_y)),
+    })  # fmt: skip
 
 
 def carries(signals: Signals, found: Segmentation) -> list[dict]:
@@ -42,10 +81,11 @@ def shown(signals: Signals, found: Segmentation) -> dict:
 
 
 def main() -> None:
-    """Save the virtual trial, the recording and a few frames of the scene."""
+    """Save the replays, the virtual trial, the recording and a few frames of the scene."""
     case = recorded()
     blocks = calibrated(identified(case))
-    simulated = simulate_trial(TWICE, case.rig, {"block2": blocks["block2"]}, SEED)
+    save_replays(case, blocks)
+    simulated = simulate_trials(TWICE, case.rig, [{"block2": blocks["block2"]}], [SEED])[0]
     signals = task_space(simulated.trial, case.rig)
     virtual = shown(signals, segment_qualitative(simulated.trial, signals, TWICE))
     first = virtual["carries"][0]

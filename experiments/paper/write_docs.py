@@ -50,7 +50,7 @@ def percent(value: float, digits: int) -> str:
 
 
 def fixed(value: float, digits: int) -> str:
-    """A number with so many decimals."""
+    """A number with the given decimals."""
     return f"{value:.{digits}f}"
 
 

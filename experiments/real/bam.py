@@ -1,20 +1,20 @@
-"""Whole logs of a servo run freely, of a gain or mass that took no part: the servo's model against BAM's M6.
+"""Free runs of a servo over logs of a gain or mass that was left out: our model against BAM's M6.
 
     python -m experiments.real.bam FOLDER [--output FILE.json]
 
-FOLDER as for `experiments.real.sts3215`. Three models are fitted to the same logs, all of their parameters at
-once, by the same least squares of the angle (soft_l1, 10 mrad) from the same starts, masses, lengths and
+FOLDER as for `experiments.real.sts3215`. Three models are fitted to the same logs, with all parameters at
+once, by the same least squares of the angle (soft_l1, 10 mrad) from the same starts, with masses, lengths and
 registers as stated:
 
     ours    experiments/real/servo.py
     m6      Rhoban/bam's friction model M6 (Duclusaud, Passault, Padois & Ly, Extended friction models for the
             physics simulation of servo actuators, 2024/2025: directional and quadratic in the load, Stribeck
-            with an exponent), with the drive as its authors have it: duty in proportion to the error
-    m6+     the same friction with the drive of `ours`: a limit of speed of the goal, dead zone, least duty
+            with an exponent), with its authors' drive: duty in proportion to the error
+    m6+     the same friction with the drive of `ours`: limited speed of the goal, dead zone, least duty
 
-One gain is left out at a time, then one mass; every log of it is run freely from its first sample to its
-last. The difference of two models' root mean squares is given with a 95 % interval by a bootstrap that draws
-configurations' motions (both repeats together), paired.
+One gain at a time is left out, then one mass; each of its logs is run freely from the first sample to the
+last. The difference between two models' root mean squares is given with a 95 % interval from a paired
+bootstrap over the motions of configurations (both repeats together).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
 SOFT = 0.01  # chosen: rad
-EVERY = 3  # numerics: of logs that a fit sees, one in so many motions' repeats
+EVERY = 3  # numerics: a fit sees one of this many repeats of a motion
 DRAWS = 2000  # numerics: of the bootstrap
 M6 = {  # start, least, most, usual size
     "stall": (6.0, 0.1, 20, 2), "emf": (1.0, 0, 5, 0.4), "viscous": (0.02, 0, 1, 0.05),

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.saving import save
-from experiments.table_text import load, markdown
+from experiments.table_text import markdown
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
@@ -131,7 +131,7 @@ def with_labels(trials: list, kind: Kind, channels: tuple[str, ...], seed: int) 
 
 
 def uncropped_clock(trials: list, kind: Kind) -> list[list[float]]:
-    """The training-mean predictor where the clock does give the labels away (leave one out)."""
+    """Leave-one-out errors of the training mean without cropping, where the clock reveals the labels."""
     labels = np.array([labels for _, labels in trials])
     means = (labels.sum(0) - labels) / (len(labels) - 1)
     return [[float(row[b]) for b in kind.scored] for row in means - labels]
@@ -181,11 +181,8 @@ def run(folder: Path, seeds: int) -> dict:
     return document
 
 
-def table() -> str | None:
+def table(found: dict) -> str:
     """docs/results.md: errors at both contact boundaries, by what was learned from."""
-    found = load("hiro_snap")
-    if found is None:
-        return None
     rows = []
     for kind, label in SHOWN.items():
         entry = found["kinds"][kind]

@@ -1,4 +1,4 @@
-"""A real servo's logs against a simulator of it: what the diagnosis says, as in the docs.
+"""Diagnosis of a real servo's logs against a simulator of it, as published in the docs.
 
     python -m experiments.real.robot_gap FOLDER [--output FILE.json] [--figures DIR]
 
@@ -28,22 +28,12 @@ from simgap.simulators.user import load_simulator
 HERE = Path(__file__).resolve().parent
 RESULT = HERE.parent / "results" / "xl330.json"
 SIMULATOR, LOGS = "xl330.py:Pendulum", "xl330_*.csv"
-KEPT = (
-    "verdict",
-    "causes",
-    "indistinguishable",
-    "detection",
-    "effects",
-    "fitted",
-    "discrepancy",
-    "shrinkage",
-    "identifiability",
-    "next_experiment",
-)
+KEPT = ("verdict", "causes", "indistinguishable", "detection", "effects", "fitted", "discrepancy",
+        "shrinkage", "identifiability", "next_experiment")  # fmt: skip
 
 
 def summary(found: RobotDiagnosis) -> dict:
-    """What the docs say of a diagnosis."""
+    """The parts of a diagnosis that the docs publish."""
     document = body(found)
     likely = sorted(document["probabilities"].items(), key=lambda item: -item[1])[:8]
     out: dict[str, Any] = {k: document[k] for k in KEPT} | {
@@ -76,7 +66,7 @@ def run(folder: Path, only: Sequence[str] = ()) -> RobotDiagnosis:
 
 
 def gains_of(names: Sequence[str]) -> list[int] | None:
-    """The gain that each log's name tells; None where some tell none."""
+    """The gain in each log's name; None if some names have none."""
     found = [re.search(r"_kp(\d+)_", name) for name in names]
     return [int(g.group(1)) for g in found if g] if all(found) else None
 

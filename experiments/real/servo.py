@@ -1,27 +1,27 @@
-"""A hobby servo that turns a weight on a rod, as a plain Python simulator of your own.
+"""A hobby servo that turns a weight on a rod, as a plain Python simulator: an example to copy.
 
-Torques at the shaft, q the angle from hanging down, w its rate, V the supply, g the goal that the drive
-follows, which is the command, `delay` late, at `pace` at most; `on` is 1 while the drive is on, `switch`
-late, for it is another register, written at another time of the cycle:
+Torques at the shaft; q is the angle from hanging down, w its rate, V the supply, g the goal that the drive
+follows: the command, delayed by `delay` and limited to the rate `pace`. `on` is 1 while the drive is on,
+delayed by `switch`, as it is another register, written at another time of the cycle.
 
     duty = on clip(sign(g - q) (gain max(|g - q| - DEAD, 0) + start), -1, 1), 0 within DEAD
     J w' = stall duty V / 12 - on emf w - viscous w - friction(w, load) - W sin(q - zero)
     W = (m l + arm l^2 / 2) G
     J = m l^2 + arm l^3 / 3 + armature
 
-`gain` has the firmware's register of the P gain in it, as duty per radian. The firmware leaves out the first
-count of an error (its dead zone) and adds a least duty (its starting force).
-`arm` is the mass of a metre of the rod, which is evenly thick. All torques but the weight's scale with the
-motor's, which was never measured, and armature adds to every inertia: as what it was, the robot moves alike
-with any arm if these grow as its weight does. So `stall`, `emf`, `viscous`, `coulomb`, `stribeck` and
-`armature` are those of a robot with a weightless arm, and grow with it: logs of one configuration then tell
-nothing of `arm` at all, and how far a mass or length changed is known no better than it.
+`gain` includes the firmware's register of the P gain, as duty per radian. The firmware ignores the first
+count of an error (its dead zone) and adds a least duty (its starting force). `arm` is the mass per metre of
+the uniform rod. All torques except the weight's scale with the motor's, which was never measured, and
+armature adds to every inertia: the robot in its original state moves the same with any arm if these grow as
+its weight does. So `stall`, `emf`, `viscous`, `coulomb`, `stribeck` and `armature` are defined for a
+weightless arm and grow with it. Logs of one configuration then carry no information on `arm`, and a change of
+mass or length is known no better than `arm`.
 
-Friction is Coulomb's, larger near standstill (Stribeck) and under load, the torque that the gears pass on:
+Friction is Coulomb's, larger near standstill (Stribeck) and under load, the torque transmitted by the gears:
 Duclusaud et al., Extended friction models for the physics simulation of servo actuators (2024), model 4. It
-is one law, of the gears: with the drive off all that goes is the motor's torque and the back-EMF. The duty is
-that of the recorded angle, so that it tells of the drive alone. Mass and length are stated; all else was
-never measured and is fitted along.
+is one law, of the gears: switching the drive off removes only the motor's torque and the back-EMF. The duty
+is computed from the recorded angle, so it depends on the drive alone. Mass and length are stated; everything
+else was never measured and is fitted along.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def _wide(nominal: float, sd: float, unit: str, low: float = 0.0, high: float = 
 
 class Servo:
     """Read-outs `position` and `duty`; commands `goal`, `volts` and `on`. `mass` [kg], `length` [m] and the
-    gain's `register` are those of the robot as it was."""
+    gain's `register` are those of the original robot."""
 
     channels = {  # noqa: RUF012
         "position": {"unit": "rad", "kind": "position"},
@@ -79,7 +79,8 @@ class Servo:
         }  # fmt: skip
 
     def with_arm(self, parameters):
-        """Parameters of the equations, what grows with the weight of the robot as it was grown."""
+        """Parameters of the equations: those of a weightless arm scaled to the weight of the original
+        robot."""
         mass, length = (self.parameters[n]["nominal"] for n in ("mass", "length"))
         more = 1 + parameters["arm"] * length / (2 * mass)
         rod = mass * length**2 + parameters["arm"] * length**3 / 3
@@ -87,7 +88,7 @@ class Servo:
         return out | {"armature": more * (mass * length**2 + parameters["armature"]) - rod}
 
     def simulate(self, parameters, recording, start=None):
-        """Semi-implicit Euler at 5 ms or less; friction holds where it can."""
+        """Integrate by semi-implicit Euler at 5 ms or less, with stiction."""
         begin = (0.0, 0.0) if start is None else (start["position"], start["position_rate"])
         values = np.array([self.with_arm(parameters)[n] for n in self.parameters])
         columns = [np.ascontiguousarray(recording[n], dtype=float) for n in ("goal", "volts", "on")]
@@ -100,15 +101,15 @@ class Servo:
 
 @njit(cache=True)
 def asked(gain, start, error, dead=DEAD):
-    """The duty that the firmware makes of an error [rad]."""
+    """The firmware's duty for an error [rad]."""
     more = max(abs(error) - dead, 0.0)
     return np.sign(error) * min(1.0, gain * more + start * min(1.0, more / DEAD))
 
 
 @njit(cache=True)
 def sent_in(t, command, sent, begin, h, delay):
-    """A command in a step from `begin` [s], and the number of the last one sent before it. One that comes
-    within the step acts for its part of it, so that angles have a derivative by the delay."""
+    """The mean of a command over a step from `begin` [s], and the number of the last one sent before it. One
+    that arrives within the step acts for the rest of it, so that angles are differentiable in the delay."""
     while sent + 1 < t.size and t[sent + 1] + delay <= begin:
         sent += 1
     value = command[sent]
@@ -120,8 +121,8 @@ def sent_in(t, command, sent, begin, h, delay):
 
 @njit(cache=True)
 def slowed(w, drag, hold):
-    """A rate [rad/s] after a step of viscous drag, implicitly, and of friction that can hold; both in units
-    of the inertia over the step."""
+    """The rate [rad/s] after a step of viscous drag (implicit) and stiction; both in units of the inertia
+    over the step."""
     w /= 1 + drag
     return 0.0 if abs(w) <= hold else w - np.sign(w) * hold
 

@@ -1,21 +1,21 @@
-"""What changed of a servo that swings a weight: labelled logs, cases drawn by seed, how often it is right.
+"""Changes of a servo that swings a weight: labelled logs, cases drawn by seed, and how often they are found.
 
     python -m experiments.real.sts3215 FOLDER [--part judge] [--cases N] [--output FILE.json]
 
-FOLDER has logs and an index.csv (file, mass, length, kp, trajectory, repeat, and motor where there are
-several). A configuration is what shares motor, mass, length and gain. Its model (experiments/real/servo.py)
-is calibrated on all of one configuration's logs, and what changed is sought in another's: nothing (second
-repeats against first ones; motions against other motions), mass, length, gain, two of these at once. Single
-samples that no servo can have made are in many logs; `spurious` cases, of which nothing changed, are given
-PLANTED more, which must be found and be no cause. --part takes one half of the configurations, split by the
-seed, so that what is developed on one can be judged on the other; `mixed` are changes from one half to the
-other.
+FOLDER has logs and an index.csv (file, mass, length, kp, trajectory, repeat, and motor if there are several).
+A configuration is a combination of motor, mass, length and gain. Its model (experiments/real/servo.py) is
+calibrated on all logs of one configuration, and changes are sought in those of another: none (second repeats
+against first ones, or motions against other motions), mass, length, gain, or two of these at once. Many logs
+contain single samples that no servo can have produced; `spurious` cases, in which nothing changed, get
+PLANTED more of them, which must be found and must not become a cause. --part selects one half of the
+configurations, split by the seed, so that methods developed on one half can be judged on the other; `mixed`
+are changes from one half to the other.
 
-What can be distinguished, from the equations: at rest and in slow motion gravity gives m l alone. In fast
-motion the inertia m l^2 + J adds to it, J the rotor's. Say that m l grew r times. By the mass, m l^2 grew r
-times; by the length, r^2 times. The two differ by m l^2 (r^2 - r) of J + m l^2 r; where that is less than
-TOLD, as J itself is known no better, mass and length are a set by right. The gain acts on the duty that is
-recorded for the same error, as nothing else does, so it is identified alone.
+What the equations can distinguish: at rest and in slow motion, gravity gives m l alone. In fast motion the
+inertia m l^2 + J adds to it, with J the rotor's. Let m l grow by a factor r. By a change of mass, m l^2 grows
+by r; by a change of length, by r^2. The two differ by m l^2 (r^2 - r) out of J + m l^2 r; if that is less
+than TOLD, to which J itself is known, mass and length are rightly a set. Only the gain changes the recorded
+duty for a given error, so it is identified alone.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from simgap.robots.unchanged import Old, without_broken
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
-TOLD = 0.1  # chosen: share of the inertia; that of the rotor is known to some 5 %
+TOLD = 0.1  # chosen: share of the inertia that can be resolved; the rotor's is known to some 5 %
 ROTOR = 0.0275  # cited: kg m^2; fits of this servo by Rhoban/bam's users, 0.027 to 0.028
-SIGN = 10.24  # data sheet: the load register's direction stands in bit 10, in units of a hundredth
-SPURIOUS = -3.14  # rad; what the bench's reader gives where it fails
+SIGN = 10.24  # data sheet: bit 10 of the load register is the direction; units of a hundredth
+SPURIOUS = -3.14  # rad; value of a failed reading on the bench
 PLANTED = 3  # chosen: spurious samples, each in another log
 FEW = 10  # logs of a configuration that a case takes at most
 GOAL = ">= 97 %"
@@ -63,7 +63,7 @@ class Case:
     new: tuple[str, ...]
     stated: tuple[float, float, float]  # mass [kg], length [m], register of the old
     truth: dict[str, float]
-    alone: bool  # whether the equations tell it alone
+    alone: bool  # whether the equations distinguish it from all others
     between: tuple[Any, Any]  # the configurations
 
 
@@ -82,7 +82,7 @@ def read(path: Path) -> Recording:
 
 
 def configurations(index: pd.DataFrame, part: str, seed: int) -> list[tuple[Any, pd.DataFrame]]:
-    """Motor, mass, length and gain with their logs; of one half, where a part is wanted."""
+    """Logs by motor, mass, length and gain, optionally of one half of the configurations."""
     keys = [k for k in ("motor", *SHOWN) if k in index]
     every = list(index.groupby(keys, sort=True))
     order = np.random.default_rng(seed).permutation(len(every))
@@ -91,7 +91,7 @@ def configurations(index: pd.DataFrame, part: str, seed: int) -> list[tuple[Any,
 
 
 def drawn(index: pd.DataFrame, part: str, count: int, seed: int) -> list[Case]:
-    """So many cases of every kind."""
+    """Draw `count` cases of every kind."""
     rng = np.random.default_rng([seed, 1])
     groups = configurations(index, part, seed)
     half = [key for key, _ in configurations(index, "develop", seed)]
@@ -136,7 +136,7 @@ def _case(
 
 
 def told_alone(stated: tuple[float, float, float], truth: dict[str, float]) -> bool:
-    """Whether the equations tell a change from any other (see above)."""
+    """Whether the equations distinguish a change from any other (see above)."""
     mass, length, _ = stated
     if len(truth) != 1 or "gain" in truth:
         return len(truth) == 1
@@ -147,7 +147,7 @@ def told_alone(stated: tuple[float, float, float], truth: dict[str, float]) -> b
 
 
 def planted(logs: Sequence[Recording]) -> list[Recording]:
-    """With a spurious angle in each of some logs, as the bench's reader gives them."""
+    """Plant a spurious angle in each of some logs, as the bench's reader produces them."""
     rng, out = np.random.default_rng(0), list(logs)
     for k in rng.permutation(len(out))[:PLANTED]:
         angle = out[k]["position"].copy()
@@ -210,7 +210,7 @@ def scored(case: Case, found: Changes) -> dict[str, Any]:
 
 
 def summary(cases: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of every figure the hits, of how many, and a 90 % interval (Clopper and Pearson)."""
+    """Hits, number and 90 % interval (Clopper and Pearson) of every figure."""
     nothing = [c for c in cases if not c["truth"]]
     changed = [c for c in cases if c["truth"]]
     sizes = {n: [c["sizes"][n] for c in changed if n in c["sizes"]] for n in ("mass", "gain", "length")}

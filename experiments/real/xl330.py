@@ -2,15 +2,16 @@
 
     hmmseg diagnose LOGS/xl330_*.csv --simulator experiments/real/xl330.py:Pendulum
 
-The drive's duty is recorded (`pwm`), so it is what drives the model; the encoder's angle is what is compared.
-Torques at the shaft, q the angle from hanging down, w its rate, u = pwm / 885:
+The drive's recorded duty (`pwm`) drives the model, and the encoder's angle is compared. Torques at the shaft;
+q is the angle from hanging down, w its rate, u = pwm / 885:
 
     k = stall u - emf w,  J w' = k - m g l sin q - viscous w - friction(w, torques) - spring q
 
-k is what the motor's current makes. stall, emf, the viscous and the Coulomb part of friction were never
-measured: they are fitted along with every cause (`fitted`). Mass and length are the owners' figures. Friction
-that depends on load, constant and near standstill, is that of Duclusaud et al., Extended friction models for
-the physics simulation of servo actuators (2024), models 3 and 4: it goes by motor's torque less the weight's.
+k is the torque of the motor's current. stall, emf and the viscous and Coulomb parts of friction were never
+measured: they are fitted along with every cause (`fitted`). Mass and length are stated by the owners.
+Friction that depends on load, constant and near standstill, follows Duclusaud et al., Extended friction
+models for the physics simulation of servo actuators (2024), models 3 and 4: it depends on the motor's torque
+minus the weight's.
 """
 
 from __future__ import annotations
@@ -42,20 +43,10 @@ class Pendulum:
         "length": {"nominal": 0.1, "sd": 0.002, "unit": "m", "low": 0.02},
         "armature": {"nominal": 0.0, "sd": 0.002, "unit": "kg m^2", "low": 0.0},
         "load_friction": {"nominal": 0.0, "sd": 0.2, "unit": "1", "low": 0.0},
-        "load_stribeck.extra": {
-            "nominal": 0.0,
-            "sd": 0.2,
-            "unit": "1",
-            "low": 0.0,
-            "effect": "load_stribeck",
-        },
-        "load_stribeck.speed": {
-            "nominal": 0.3,
-            "sd": 0.2,
-            "unit": "rad/s",
-            "low": 0.02,
-            "effect": "load_stribeck",
-        },
+        "load_stribeck.extra": {"nominal": 0.0, "sd": 0.2, "unit": "1", "low": 0.0,
+                                "effect": "load_stribeck"},
+        "load_stribeck.speed": {"nominal": 0.3, "sd": 0.2, "unit": "rad/s", "low": 0.02,
+                                "effect": "load_stribeck"},
         "stribeck.extra": {"nominal": 0.0, "sd": 0.03, "unit": "N m", "low": 0.0, "effect": "stribeck"},
         "stribeck.speed": {"nominal": 0.3, "sd": 0.2, "unit": "rad/s", "low": 0.02, "effect": "stribeck"},
         "direction_friction": {"nominal": 0.0, "sd": 0.02, "unit": "N m"},
@@ -63,7 +54,7 @@ class Pendulum:
         "quadratic_drag": {"nominal": 0.0, "sd": 1e-3, "unit": "N m s^2/rad^2", "low": 0.0},
         "spring": {"nominal": 0.0, "sd": 0.02, "unit": "N m/rad", "low": 0.0},
         "joint_zero": {"nominal": 0.0, "sd": 0.01, "unit": "rad"},
-    }
+    }  # fmt: skip
     says = {  # noqa: RUF012
         "load_friction": "Coulomb friction grows by this share of what motor and weight press on the gears",
         "load_stribeck": "loaded gears rub more near standstill, by extra exp(-(w / speed)^2) of the load",
@@ -76,12 +67,12 @@ class Pendulum:
     }
 
     def simulate(self, parameters, recording, start=None):
-        """Semi-implicit Euler at 1 ms or less; friction holds where it can."""
+        """Integrate by semi-implicit Euler at 1 ms or less, with stiction."""
         begin = (0.0, 0.0) if start is None else (start["position"], start["position_rate"])
         values = np.array([parameters[n] for n in self.parameters])
         columns = [np.ascontiguousarray(recording[n]) for n in ("pwm", "torque_enable")]
         angle = swing(values, recording.t, *columns, *begin)
-        # The encoder is the first of five reads: what it tells is that much older than its stamp.
+        # The encoder is the first of five reads, so its value is older than its time stamp.
         return {"position": angle - EARLIER * np.gradient(angle, recording.t)}
 
 

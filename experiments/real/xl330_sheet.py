@@ -40,7 +40,7 @@ MAP = '[columns.position]\njoint = "shaft"\nunit = "rad"\n[columns.duty]\nactuat
 
 
 def prepared(folder: Path, into: Path) -> list[Path]:
-    """The logs with the columns that the model has."""
+    """Write the logs with the model's columns."""
     out = []
     for path in sorted(folder.glob("xl330_*.csv")):
         log = pd.read_csv(path)
@@ -51,7 +51,7 @@ def prepared(folder: Path, into: Path) -> list[Path]:
 
 
 def draw(loaded: Loaded, logs: list[Recording], left_out: Recording, path: Path) -> None:
-    """A log that no fit saw, run freely from its first sample."""
+    """Draw a log that took no part in the fit, run freely from its first sample."""
     effects = effects_of(loaded.simulator, logs, loaded.effects(logs), UNMEASURED)
     found = calibrate(loaded.simulator, logs, effects, judged=False)
     mine = found.composed.effects

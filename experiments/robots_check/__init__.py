@@ -1,1 +1,1 @@
-"""The diagnosis checked blind on robots that others modelled, with seeded faults drawn here."""
+"""Blind check of the diagnosis on robots modelled by others, with seeded faults."""

@@ -1,4 +1,4 @@
-"""Seeded faults in robots that others modelled, diagnosed and scored once.
+"""Seeded faults in robots modelled by others, diagnosed and scored.
 
     python -m experiments.robots_check MODELS --seed 1 --cases 24 --out DIR    # resumable: done cases stay
     python -m experiments.robots_check MODELS --seed 2 --cases 24 --robots reacher --out DIR

@@ -1,4 +1,4 @@
-"""The faults that worlds have: how each is planted, how large it usually is, and what names it rightly.
+"""Faults: how each is planted, its usual size, and the diagnoses that count as right.
 
 `outside` ones are of no candidate's family: the right answers are `unknown`, or a remainder that is reported.
 """
@@ -128,7 +128,7 @@ def _cogging(world: World, fault: Fault, sizes: Sizes) -> None:
 
 
 def _gusts(world: World, fault: Fault, sizes: Sizes) -> None:
-    """Pushes from elsewhere that neither angle nor command tells."""
+    """External pushes, independent of angle and command."""
     dof, size = _dof(world, fault.thing), fault.size * sizes[fault.thing][0]
     world.torque.append(
         lambda data, t: data.qfrc_applied.__setitem__(
@@ -186,6 +186,6 @@ def drawn(robot: Robot, world: World, kind: str, rng: np.random.Generator) -> Fa
     joint = robot.driven[actuator][0]
     thing = {JOINT: joint, ACTUATOR: actuator, READ: joint, WHOLE: ""}[found.on]
     names = {"j": joint, "a": actuator, "b": _body(world, joint)}
-    # Where one joint is all that is read and driven, a log that is late is one of a command that is.
+    # With a single joint, a late reading is equivalent to a late command.
     late = ("command.delay",) if kind == "read_lag" and len(robot.read) == 1 else ()
     return Fault(kind, thing, size, (*(r.format(**names) for r in found.right), *late))

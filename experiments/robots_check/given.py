@@ -1,4 +1,4 @@
-"""Cases that another generator made, diagnosed as a user would and scored.
+"""Cases by another generator, diagnosed as by a user, and scored.
 
     python -m experiments.robots_check.given FOLDER [CASE...]    # results/robots_check_given.json
 
@@ -22,7 +22,7 @@ OUT = Path(__file__).resolve().parents[1] / "results" / "robots_check_given.json
 
 
 def diagnosed(case: Path) -> dict[str, Any]:
-    """The document, with processor seconds of the whole command."""
+    """The document, with the command's processor time [s]."""
     with tempfile.TemporaryDirectory() as place:
         target = Path(place) / "found.json"
         logs = [str(p) for p in sorted(case.glob("train_*.csv"))]

@@ -1,4 +1,4 @@
-"""Robots out of packages' wheels, made light (meshes left out) and changed a little, and their motions.
+"""Robots from packages' wheels, without meshes and with slightly changed masses, and their motions.
 
 pip download --no-deps --only-binary :all: -d DIR dm-control robosuite     # then unzip the wheels in DIR
 """
@@ -14,16 +14,17 @@ import mujoco
 import numpy as np
 
 LIKE: Any = mujoco
-LONGEST = 0.005  # s: solver's step of the diagnosing model at most
+LONGEST = 0.005  # s; longest step of the diagnosing model's solver
 
 
 @dataclass(frozen=True)
 class Robot:
-    """Where its model stands in a folder of unzipped wheels; `driven`: actuator to joint and command's unit;
-    `read`: joints that are recorded; `reach` [rad] and `rate` [Hz] of its motions about the pose `about`;
-    `seconds` of a log. `grip`: actuator to its constant command; `carried`: two slides that bring a body to a
-    site, where it is gripped before a log begins; `without` which bodies the model is read; its solver's
-    `step` [s], if another than the package's."""
+    """A robot: the path of its model in a folder of unzipped wheels; `driven`, the joint and command unit of
+    each actuator; `read`, the recorded joints; `reach` [rad] and `rate` [Hz] of motions about the pose
+    `about`; `seconds` of a log. `grip`: constant commands of actuators; `carried`: two slides that bring a
+    body to a site, where it is gripped before a log begins; `without`: bodies that are removed; `step` [s] of
+    the solver, if not the package's.
+    """
 
     name: str
     file: str
@@ -101,7 +102,7 @@ ROBOTS = (
 
 
 def nominal_xml(robot: Robot, models: Path, rng: np.random.Generator) -> str:
-    """The diagnosing model: the package's, without meshes, masses and damping other than there."""
+    """The diagnosing model: the package's without meshes, with other masses and damping."""
     spec = LIKE.MjSpec.from_file(str(models / robot.file))
     for geom in list(spec.geoms):
         if geom.type == LIKE.mjtGeom.mjGEOM_MESH:
@@ -122,7 +123,7 @@ def nominal_xml(robot: Robot, models: Path, rng: np.random.Generator) -> str:
 
 
 def map_toml(robot: Robot, noise: Mapping[str, float]) -> str:
-    """Which column is which: commands by actuator, positions by joint, with their `noise`."""
+    """The map of columns: commands by actuator, positions by joint with their `noise`."""
     units = {a: unit for a, (_, unit) in robot.driven.items()} | dict.fromkeys(robot.grip, "1")
     out = [f'[columns.u_{a}]\nactuator = "{a}"\nunit = "{unit}"\n' for a, unit in units.items()]
     out += [f'[columns.q_{j}]\njoint = "{j}"\nnoise = {noise[j]}\n' for j in robot.read]

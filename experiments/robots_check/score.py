@@ -1,4 +1,4 @@
-"""What the check is scored by, pooled over robots."""
+"""Scores of the check, pooled over robots."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-NUMERICS = "option."  # steps and integrators do differ: naming them is no false alarm
-FLOOR = 15.0  # nats; of a fault that shows less, not even one who knows all else could be sure
+NUMERICS = "option."  # steps and integrators differ indeed, so naming them is no false alarm
+FLOOR = 15.0  # nats; a smaller fault is not certain even if all else is known
 
 
 def share(hits: int, of: int) -> dict[str, Any]:
@@ -20,7 +20,7 @@ def share(hits: int, of: int) -> dict[str, Any]:
 
 
 def above(fault: Mapping[str, Any]) -> bool:
-    """Whether a fault shows enough to be found."""
+    """Whether a fault is large enough to be found."""
     return fault["nats"] >= FLOOR
 
 
@@ -35,13 +35,13 @@ def right(one: Mapping[str, Any]) -> bool:
     allowed = {r for f in one["faults"] for r in f["right"]}
     met = all(every & set(f["right"]) for f in one["faults"] if above(f))
     strange = [n for n in _physical(named) if n not in allowed]
-    # In a set, what stands for a fault may be any of its rivals.
+    # In a set, any of its rivals may stand for a fault.
     spare = len([f for f in one["faults"] if not set(named) & set(f["right"])])
     return met and len(strange) <= spare and one["found"]["verdict"] in ("named", "set")
 
 
 def alarm(one: Mapping[str, Any]) -> bool:
-    """Whether anything but its numerics is named of a healthy robot."""
+    """Whether anything but numerics is named for a healthy robot."""
     found = one["found"]
     return found["verdict"] == "unknown" or bool(_physical(found["causes"]))
 
@@ -54,7 +54,7 @@ def held_back(one: Mapping[str, Any]) -> bool:
 
 
 def covered(one: Mapping[str, Any]) -> list[bool]:
-    """Of rightly named faults whose parameter has the fault's own unit: whether the interval holds it."""
+    """Whether intervals contain the sizes of rightly named faults, where units agree."""
     out = []
     same = {"delay": "delay", "read_gain": "gain", "read_bias": "bias", "read_lag": "delay", "gain": "gain"}
     effects = one["found"]["effects"]
@@ -70,7 +70,7 @@ def covered(one: Mapping[str, Any]) -> list[bool]:
 
 
 def scored(every: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The figures, pooled and by kind, and every case in a line."""
+    """The figures, pooled and by kind, and a summary of every case."""
     of = lambda *kinds: [c for c in every if c["kind"] in kinds]  # noqa: E731
     healthy = of("healthy")
     outside = [c for c in of("outside") if above(c["faults"][0])]

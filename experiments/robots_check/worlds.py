@@ -1,6 +1,6 @@
-"""True robots: the diagnosing model integrated otherwise, with faults, run by a controller and recorded.
+"""True robots: the diagnosing model with another integrator and faults, run by a controller and recorded.
 
-Nothing of the product's effects is used: faults act on the compiled model, in the loop, or on the record.
+None of the product's effects is used: faults act on the compiled model, in the loop, or on the record.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ NOISE = 5e-4  # rad, of hinges
 PLACE_NOISE = 1e-4  # m, of slides
 FINER = 3  # the world's step is the model's over this
 LOGS = 3
-WINDOW = 40  # rows of what a fault is seen in
+WINDOW = 40  # rows; window for a fault's detectability
 PACE = 2.5  # Hz: of the controller
-HELD, SETTLED = 1.0, 0.5  # s: while a body is held where the grip closes on it, and then until the log begins
+HELD, SETTLED = 1.0, 0.5  # s; a body is held while the grip closes on it, then settles until the log begins
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing wrong: `kind`, on which joint or actuator, its `size`, the causes that name it `right`ly."""
+    """A fault: its `kind`, the joint or actuator, its `size`, and the causes that name it `right`ly."""
 
     kind: str
     thing: str
@@ -37,7 +37,7 @@ class Fault:
 
 @dataclass
 class World:
-    """A model, with what of the record and the commands is wrong; `torque` acts besides the actuators."""
+    """A model with faults of its record and commands; `torque` acts in addition to the actuators."""
 
     model: Any
     command: list[Callable[[np.ndarray, np.ndarray], np.ndarray]]
@@ -46,7 +46,7 @@ class World:
 
 
 def usual(robot: Robot, xml: str) -> dict[str, tuple[float, float, float]]:
-    """By joint, rms of torque, rate and acceleration along a motion of the plain model."""
+    """Rms torque, rate and acceleration of each joint along a motion of the plain model."""
     rng = np.random.default_rng(0)
     model = LIKE.MjModel.from_xml_string(xml)
     shown = run(robot, World(model, [], {}, []), motion(robot, rng), measure=True)
@@ -54,7 +54,7 @@ def usual(robot: Robot, xml: str) -> dict[str, tuple[float, float, float]]:
 
 
 def motion(robot: Robot, rng: np.random.Generator) -> Callable[[float], np.ndarray]:
-    """Wanted angles of the driven joints: about a pose, three sines each."""
+    """Desired angles of the driven joints: three sines each, about a pose."""
     count = len(robot.driven)
     rates = 2 * np.pi * robot.rate * rng.uniform(0.4, 1.7, (count, 3))
     sizes = robot.reach * rng.uniform(0.2, 0.6, (count, 3))
@@ -64,7 +64,7 @@ def motion(robot: Robot, rng: np.random.Generator) -> Callable[[float], np.ndarr
 
 
 def noise_of(robot: Robot, xml: str) -> dict[str, float]:
-    """By recorded joint, the sd of one sample."""
+    """Noise sd of one sample, by recorded joint."""
     model = LIKE.MjModel.from_xml_string(xml)
     slide = int(LIKE.mjtJoint.mjJNT_SLIDE)
     return {j: PLACE_NOISE if int(model.joint(j).type[0]) == slide else NOISE for j in robot.read}
@@ -147,8 +147,8 @@ def nats(
     robot: Robot, xml: str, faults: list[Fault], sizes: Mapping[str, tuple[float, float, float]],
     wanted: Callable[[float], np.ndarray], noise: Mapping[str, float],
 ) -> list[float]:  # fmt: skip
-    """What each fault shows in a log [nats] to one who knows all else: half the squares, in units of the
-    noise, by which windows begun from the true states go otherwise without it, straight lines left out."""
+    """Detectability of each fault in a log [nats] if all else is known: half the squared deviations, in units
+    of the noise, of windows restarted from the true states without the fault, straight lines left out."""
     states: list[np.ndarray] = []
     shown = run(robot, world_of(xml, faults, sizes), wanted, states=states)
     faulty = _replayed(robot, world_of(xml, faults, sizes), shown, states)
@@ -197,7 +197,7 @@ def _replayed(robot: Robot, world: World, shown: Mapping, states: list[np.ndarra
 
 
 def _hold(robot: Robot, model: Any, data: Any) -> None:
-    """Keep what is carried where the grip closes on it."""
+    """Keep a carried body where the grip closes on it."""
     if robot.carried is None:
         return
     along, up, site = robot.carried
@@ -207,7 +207,7 @@ def _hold(robot: Robot, model: Any, data: Any) -> None:
 
 
 def world_of(xml: str, faults: list[Fault], sizes: Mapping[str, tuple[float, float, float]]) -> World:
-    """The true world: the model by another integrator at a finer step, and its faults."""
+    """The true world: the model with another integrator, a finer step, and faults."""
     from experiments.robots_check.faults import FAULTS
 
     model = LIKE.MjModel.from_xml_string(xml)

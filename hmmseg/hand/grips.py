@@ -1,10 +1,10 @@
 """When a gripper closes on something, and the opening at which its pads touch it.
 
-An opening goes up and down between turning points. A closing that ends in a stand grips, with the opening
-held there; pads and drive give in a grip, so that the touch is further open. What the pads press with and
-their stiffness tell by how much. Else the way itself does: a closing gripper has not touched yet while it is
-at its fastest, and an opening one leaves its stand where the pads let go. `Closings` takes samples one by
-one, of a whole recording as of one that is still being made.
+An opening moves between turning points. A closing that ends in a stand grips, at the opening held there;
+pads and drive yield in a grip, so that the touch is further open. The grip force and the pads' stiffness
+tell by how much. Otherwise the motion itself does: a closing gripper has not touched yet while it is at its
+fastest, and an opening one leaves its stand where the pads let go. `Closings` works sample by sample, for
+whole recordings as for streams.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from hmmseg.hand.signals import grouped
 from hmmseg.levels import SURE
 from hmmseg.robust import median_of_known, white_sd
 
-STEP = 0.02  # numerics: s; speeds are taken over this: a gripper's motor changes them no faster
-SOFT = 0.1  # prior: of what gives in a grip: its touch is known no better, as pads are no ideal springs
-GIVE = (1e-3, 1.5e-3)  # prior: m, mean and sd: what pads and drive give in a grip, before anything is seen
-REST = 0.1  # chosen: share of an opening's way, or of its top speed, that is next to none: the gripper stands
+STEP = 0.02  # numerics: s over which speeds are taken: a gripper's motor changes them no faster
+SOFT = 0.1  # prior: relative error of the yield in a grip, as pads are no ideal springs
+GIVE = (1e-3, 1.5e-3)  # prior: m, mean and sd: yield of pads and drive in a grip, before anything is seen
+REST = 0.1  # chosen: share of an opening's range, or of its top speed, below which the gripper stands
 LEAST_CLOSING = 1e-3  # limit: m; a smaller swing of the opening is no grip
 
 
@@ -28,8 +28,8 @@ LEAST_CLOSING = 1e-3  # limit: m; a smaller swing of the opening is no grip
 class Grip:
     """One closing on something: samples [start, stop) in which the pads touch it.
 
-    `held` [m]: the opening at which it stands; `width` [m] and `width_sd`: the opening at which both
-    pads just touch.
+    `held` [m]: the opening at which it stands; `width` [m] and its sd: the opening at which both pads just
+    touch.
     """
 
     start: int
@@ -40,17 +40,17 @@ class Grip:
 
 
 class Closings:
-    """Closings of an opening by its turning points, from swings that count.
+    """Turning points of an opening, between swings of at least `swing` [m].
 
-    `swing` [m]: the least that counts; `closing`: whether the opening has not turned up since it closed;
-    `extreme`: where it was widest since it turned up, or closest since it turned down.
+    `closing`: whether the opening has last turned downwards; `extreme`: time and opening of the least value
+    since then, or of the greatest since it last turned upwards.
     """
 
     def __init__(self, swing: float) -> None:
         self.swing, self.closing, self.extreme = swing, False, (0.0, -np.inf)
 
     def take(self, at: float, opening: float) -> bool:
-        """The opening [m] at a next time or sample; whether it has turned."""
+        """Take the opening [m] at the next time or sample; returns whether it has turned."""
         extreme = self.extreme[1]
         away = extreme - opening if not self.closing else opening - extreme
         if away <= 0:
@@ -61,14 +61,14 @@ class Closings:
         return True
 
 
-# Samples: where it begins and is least, and where it is open again, if so.
+# Samples: where it begins, where it is least, and where it is open again (None if it stays closed).
 Closing = tuple[int, int, int | None]
 
 
 def closings(opening: np.ndarray) -> list[Closing]:
     """Closings of a whole opening (num_timesteps,) [m].
 
-    A swing counts where it is a tenth of the whole way and beyond the noise.
+    A swing counts if it exceeds a tenth of the range, and noise.
     """
     each = Closings(least_swing(float(np.ptp(opening)), white_sd(opening)))
     turning = []
@@ -81,7 +81,7 @@ def closings(opening: np.ndarray) -> list[Closing]:
 
 
 def free_samples(opening: np.ndarray, found: list[Closing]) -> np.ndarray:
-    """Samples (num_timesteps,) that are surely no grip's: more open than halfway back."""
+    """Samples (num_timesteps,) outside any grip: more open than halfway to the least of their closing."""
     free = np.ones(opening.size, bool)
     for begun, least, opened in found:
         inside, top = slice(begun, None if opened is None else opened + 1), _ceiling(opening, begun, opened)
@@ -90,21 +90,20 @@ def free_samples(opening: np.ndarray, found: list[Closing]) -> np.ndarray:
 
 
 def _ceiling(opening: np.ndarray, begun: int, opened: int | None) -> float:
-    """How far open it is both before and after a closing [m]."""
+    """Opening [m] that is reached both before and after a closing."""
     return float(min(opening[begun], np.inf if opened is None else opening[opened]))
 
 
-def least_swing(way: float, noise: float) -> float:
-    """The least swing that counts [m] of an opening that goes so far, with this noise sd [m]."""
-    return max(REST * way, 2 * SURE * noise, LEAST_CLOSING)
+def least_swing(extent: float, noise: float) -> float:
+    """The least swing that counts [m] for an opening with this range and noise sd [m]."""
+    return max(REST * extent, 2 * SURE * noise, LEAST_CLOSING)
 
 
 def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
             pressing: np.ndarray | float | None, stiffness: float) -> Grip | None:  # fmt: skip
-    """The grip that a closing ends in; None where the opening never stands.
+    """The grip that a closing ends in; None if the opening never stands.
 
-    `pressing` (num_timesteps,) [N]: what each pad presses with, None where it is unknown; `stiffness` [N/m]
-    of one pad.
+    `pressing` (num_timesteps,) [N]: force of each pad, None if unknown; `stiffness` [N/m] of one pad.
     """
     begun, least, opened = closing
     floor, end = float(opening[least]), t.size - 1 if opened is None else opened
@@ -117,7 +116,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
     else:
         widest = _fastest(t, opening, begun, first, held)
         seen = _release(t, opening[: end + 1], last, held)
-        if seen is None or not held < seen[0] <= widest:  # it opens in steps, or not yet
+        if seen is None or not held < seen[0] <= widest:  # it opens in steps, or has not opened yet
             seen = (widest + held) / 2, max((widest - held) / np.sqrt(12), _noise(opening))
         width, sd = _with_prior(seen, held)
     start = int(inside[np.argmax(opening[inside] <= width)])
@@ -127,7 +126,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
 
 
 def _fastest(t: np.ndarray, opening: np.ndarray, begun: int, first: int, held: float) -> float:
-    """Opening [m] at which a closing is fastest: what is touched later is narrower."""
+    """Opening [m] at which a closing is fastest, an upper bound of the width."""
     way = _coarse(t, opening, begun, first + 1)
     if way.size < 2:
         return max(float(opening[begun]), held)
@@ -136,7 +135,8 @@ def _fastest(t: np.ndarray, opening: np.ndarray, begun: int, first: int, held: f
 
 
 def _release(t: np.ndarray, opening: np.ndarray, last: int, held: float) -> tuple[float, float] | None:
-    """Opening [m] at which fingers that stand at `last` take off, and its sd; None where noise hides it."""
+    """Opening [m] at which the fingers leave their stand after sample `last`, and its sd; None within
+    noise."""
     lead = max(3, int(3 * STEP / np.median(np.diff(t))))
     way, noise = _coarse(t, opening, max(last - lead, 0), opening.size), _noise(opening)
     wide = np.flatnonzero(way > (held + opening[-1]) / 2)
@@ -151,7 +151,7 @@ def _release(t: np.ndarray, opening: np.ndarray, last: int, held: float) -> tupl
 
 
 def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.ndarray:
-    """The opening [m] every STEP, means of what lies within, of samples [start, stop)."""
+    """Means of the opening [m] over each STEP, of samples [start, stop)."""
     group = max(1, int(STEP / float(np.median(np.diff(t))) + 1e-6))
     return grouped(opening[start:stop], group)[0]
 
@@ -162,7 +162,8 @@ def _noise(opening: np.ndarray) -> float:
 
 
 def _with_prior(seen: tuple[float, float], held: float) -> tuple[float, float]:
-    """Mean and sd [m] of the opening at the touch, from what was seen of it and what pads give."""
+    """Mean and sd [m] of the opening at the touch: what was `seen` of it, combined with the prior on the
+    yield."""
     precision = np.array([seen[1], GIVE[1]]) ** -2.0
     mean = max(float(precision @ [seen[0], held + GIVE[0]] / precision.sum()), held)
     return mean, max(float(precision.sum() ** -0.5), SOFT * (mean - held))

@@ -1,9 +1,9 @@
-"""What is in a recording's file, and the mapping that would read it.
+"""What is in a recording's file, and a proposed mapping that would read it.
 
-Channels come with their units, rates, gaps and ranges. Names are taken apart into words: which finger (left,
-right, 1, 2), which quantity (position, velocity, force, joint), which axis. Of three axes the plane of the
-work is looked for in what the fingers do. What is proposed is mended by what physics says of the recording;
-a person looks at the rest.
+Channels come with their units, rates, gaps and ranges. Names are split into words: which finger (left,
+right, 1, 2), which quantity (position, velocity, force, joint), which axis. If there are three axes, the
+plane of the work is inferred from the fingers' motion. The checks of `hmmseg.hand.plausibility` correct the
+proposal; a person confirms it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from hmmseg.io.trial import (
     mapped_times,
     trial_of,
 )
-from hmmseg.io.units import UNITS, Column, known_unit, measures, unit_in_name
+from hmmseg.io.units import UNITS, Column, measures, unit_in_name
 from hmmseg.levels import GAP
 
 BUCKETS = 24  # numerics: of a small plot
@@ -39,8 +39,8 @@ BUCKETS = 24  # numerics: of a small plot
 
 @dataclass(frozen=True)
 class Channel:
-    """One column: its unit where the file or its name gives it, its rate [Hz] where times are known,
-    how many samples lack it or were interpolated, its range, and its course in few means.
+    """One column: its unit if the file or its name states one, its rate [Hz] if times are known, how many
+    samples are missing or interpolated, its range, and its course as a few means.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Channel:
 class Inspection:
     """One file: its recordings, its clock, gaps [(start, end) in s], channels and proposed mapping.
 
-    `understood`: all that a hand needs (this rig's, or one of two fingers) is there under our names.
+    `understood`: whether all that a hand needs (this rig's, or one of two fingers) is there under our names.
     """
 
     file: str
@@ -73,41 +73,39 @@ class Inspection:
     channels: tuple[Channel, ...]
     mapping: dict[str, dict[str, Any]]
     toml: str
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
     understood: bool
 
 
 def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
-    """What a file holds (of several recordings the first), judged with the rig where it is given."""
+    """Contents of a file (of several recordings the first), checked with the rig if it is given."""
     parts = parts_of(path)
     table = read_table(f"{path}#{parts[0]}" if parts else path)
     if not table.names or not table.rows.size:
         raise InputError(str(path), "is empty", "a header row and a row for every sample")
     already = {} if rig is None else (rig.topics if table.messages else rig.columns)
     entries = {} if already else propose(table)
-    entries, said = mended(table, entries, rig)
+    entries, remarks = correct(table, entries, rig)
     by_length: dict[int, list[str]] = {}
     for name, values in table.columns.items():
         by_length.setdefault(len(values), []).append(name)
     others = f"not {table.rows.size} as the others: they are not read together"
     odd = [f"columns {', '.join(names)} have {length} rows, {others}"
            for length, names in by_length.items() if length != table.rows.size]  # fmt: skip
-    said = [*table.notes, *(f"{path}: {line}" for line in (*odd, *said))]
+    remarks = [*table.notes, *(f"{path}: {line}" for line in (*odd, *remarks))]
     toml = as_toml(entries, table) if entries else ""
     if set(entries) <= {"t"} and not already and (rig is None or rig.gripper is None):
         toml = propose_gripper(table, entries) or toml
     t, origin = _clock(table, entries, rig)
     channels = tuple(_channel(table, name, t) for name in table.names if name in table.columns)
-    gaps: list[tuple[float, float]] = []
-    rate, ends = None, (None, None) if t is None or not t.size else (float(t[0]), float(t[-1]))
-    if t is not None and t.size > 2:
-        steps = np.diff(t)
-        rate = float(1 / np.median(steps)) if np.median(steps) > 0 else None
-        wide = np.flatnonzero(steps > GAP * np.median(steps))
-        gaps = [(float(t[i]), float(t[i + 1])) for i in wide]
+    start, end, rate, gaps = None, None, None, ()
+    if t is not None:
+        period = np.median(np.diff(t))
+        start, end, rate = float(t[0]), float(t[-1]), float(1 / period)
+        gaps = tuple((float(t[i]), float(t[i + 1])) for i in np.flatnonzero(np.diff(t) > GAP * period))
     return Inspection(
-        str(path), tuple(parts), int(table.rows.size), *ends, rate, origin, tuple(gaps), channels, entries,
-        toml, tuple(said), not toml and _understood(table, rig),
+        str(path), tuple(parts), int(table.rows.size), start, end, rate, origin, gaps, channels, entries,
+        toml, tuple(remarks), not toml and _understood(table, rig),
     )  # fmt: skip
 
 
@@ -123,7 +121,7 @@ def _understood(table: Table, rig: Rig | None) -> bool:
 
 def _clock(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None
            ) -> tuple[np.ndarray | None, int | None]:  # fmt: skip
-    """Times [s] as the proposal or the rig has them; None where the file has none that can be used."""
+    """Times [s] by the proposal or the rig; None if the file has none that can be used."""
     rig = rig or Rig()
     if "t" in entries:
         rig = rig.model_copy(update={"columns": {**rig.columns, "t": Column.model_validate(entries["t"])}})
@@ -142,7 +140,7 @@ def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
         return Channel(name, unit, None, len(table.columns[name]), 0, 0, None, None, (), text=True)
     there = values[np.isfinite(values)]
     rate = table.rates.get(name)
-    if rate is None and t is not None and t.size > 2 and t[-1] > t[0]:
+    if rate is None and t is not None:
         rate = float((there.size - 1) / (t[-1] - t[0]))
     low, high = (float(there.min()), float(there.max())) if there.size else (None, None)
     pieces = [p[np.isfinite(p)] for p in np.array_split(values, min(BUCKETS, max(values.size, 1)))]
@@ -162,63 +160,61 @@ QUANTITIES = {
     "p": {"pos", "position", "positions", "pose", "tip", "xyz", "x", "y", "z", "point", "weg", "lage"},
 }
 VECTORS = {3: "xyz", 4: "xyzw"}
-MOVES = 1e-3  # numerics: of the longest travel; an axis along which fingers move less is none they work in
+MOVES = 1e-3  # numerics: share of the longest travel; along an axis with less the fingers do not work
 AXES = {"x": {"x", "fx", "vx"}, "y": {"y", "fy", "vy"}, "z": {"z", "fz", "vz"}}
 TURNING = {"torque", "moment", "mx", "my", "mz", "tx", "ty", "tz", "orientation", "quaternion", "rot"}
 
 
 def propose(table: Table) -> dict[str, dict[str, Any]]:
-    """Entries of `[columns]` (`[topics]` for a log) by our channel; empty where none is needed or found.
+    """Entries of `[columns]` (`[topics]` for a log) by our channel; empty if none is needed or found.
 
-    Channels come with their unit where the file or the name states one that is not SI.
+    An entry has a unit if the file or the name states one that is not SI.
     """
     names = [name for name in table.names if name != "t" or not table.messages]
     sources: dict[str, str] = {} if table.messages else _time_column(names)
     for channels in (CARTESIAN_CHANNELS, JOINT_CHANNELS):
         found = {channel: channel for channel in channels if channel in names}
-        found |= {channel: name for channel, name in _matched(names, table).items()
+        found |= {channel: name for channel, name in _match_channels(names, table).items()
                   if channel in channels and channel not in found}  # fmt: skip
         if len(found) > len(channels) / 2:
             sources |= found
             break
     out: dict[str, dict[str, Any]] = {}
     for channel, source in sources.items():
-        unit = table.units.get(source) or unit_in_name(source)
-        wanted = measures(channel)
-        fits = unit is not None and (wanted is None or UNITS[known_unit(unit) or ""][0] == wanted)
-        fields = {"from": source} | ({"unit": unit} if fits and UNITS[unit or ""][1] != 1 else {})
+        unit, fields = table.units.get(source) or unit_in_name(source), {"from": source}
+        if unit is not None and UNITS[unit][0] == measures(channel) and UNITS[unit][1] != 1:
+            fields["unit"] = unit
         if fields != {"from": channel}:
             out[channel] = fields
     return out
 
 
-def mended(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = None
+def correct(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = None
            ) -> tuple[dict[str, dict[str, Any]], list[str]]:  # fmt: skip
-    """The proposal after what physics says of the recording, and what it said, line by line.
+    """The proposal corrected by the checks of the recording, and their findings, line by line.
 
-    Where no rig is given, links of a length of their own cannot be known: a jointed hand is
-    judged only with its rig.
+    Without a rig the lengths of links are unknown, so that a jointed hand is checked only with its rig.
     """
     rig = rig or Rig()
-    said: list[str] = []
+    remarks: list[str] = []
     for _ in range(8):
         mapping = {name: Column.model_validate(fields) for name, fields in entries.items()}
         where = "topics" if table.messages else "columns"
         hand = rig.model_copy(update={where: {**getattr(rig, where), **mapping}})
         try:
             found = findings(trial_of(table, hand, None), hand)
-        except InputError:  # not a hand's recording, or not all of it: its clock alone
+        except InputError:  # not a hand's recording, or incomplete: only its clock can be checked
             try:
                 clock = Trial(table.file, mapped_times(table, hand)[0], {})
             except InputError:
-                return entries, said
+                return entries, remarks
             found = [replace(f, certain=True) for f in check_clock(clock, hand, moving=False) if f.changes]
-        said += [line for f in found if (line := f"column {f.channel} {f.problem}") not in said]
+        remarks += [line for f in found if (line := f"column {f.channel} {f.problem}") not in remarks]
         fresh = {k: v for f in found if f.certain or f.channel == "t" for k, v in f.changes.items()}
         if not fresh or all(entries.get(name) == fields for name, fields in fresh.items()):
-            return entries, said
+            return entries, remarks
         entries = {**entries, **fresh}
-    return entries, said
+    return entries, remarks
 
 
 def as_toml(entries: Mapping[str, Mapping[str, Any]], table: Table) -> str:
@@ -237,11 +233,11 @@ def _time_column(names: Sequence[str]) -> dict[str, str]:
     return {}
 
 
-def _matched(names: Sequence[str], table: Table) -> dict[str, str]:
-    """The first column that fits each of our channels, as the axes of the work go by x and y."""
+def _match_channels(names: Sequence[str], table: Table) -> dict[str, str]:
+    """The first column that fits each of our channels, with the axes of the work renamed to x and y."""
     found: dict[str, str] = {}
-    for name, parts in split(names).items():
-        channel = _meant(parts)
+    for name, parts in split_names(names).items():
+        channel = _channel_meant(parts)
         if channel is not None:
             found.setdefault(channel, name)
     across, up = _plane(found, table)
@@ -256,10 +252,10 @@ def _matched(names: Sequence[str], table: Table) -> dict[str, str]:
 
 
 def _plane(found: Mapping[str, str], table: Table) -> tuple[str, str]:
-    """Axes across and up of fingers whose channels (with z for a third axis) come from these columns.
+    """Axes across and up, for fingers whose channels (with z as a third axis) come from these columns.
 
-    Up is z where the fingers move along it (ROS, REP 103) or there is no y; across is where they stand
-    apart most.
+    Up is z if the fingers move along it (ROS, REP 103) or there is no y; across is where they are farthest
+    apart.
     """
     there = [axis for axis in "xyz" if {f"{axis}1", f"{axis}2"} <= set(found)]
     if len(there) < 3:
@@ -277,8 +273,8 @@ def _plane(found: Mapping[str, str], table: Table) -> tuple[str, str]:
     return max(apart, key=lambda axis: apart[axis]), up
 
 
-def split(names: Sequence[str]) -> dict[str, list[str]]:
-    """Words of each name; the entries of a vector of three or four end in their axis instead of a number."""
+def split_names(names: Sequence[str]) -> dict[str, list[str]]:
+    """Words of each name; entries of a vector of three or four end in their axis instead of their index."""
     out = {}
     for name in names:
         base, _, index = name.removesuffix("]").rpartition("[")
@@ -287,8 +283,8 @@ def split(names: Sequence[str]) -> dict[str, list[str]]:
     return out
 
 
-def _meant(words: list[str]) -> str | None:
-    """Our channel (with z for a third axis) that a name's words mean."""
+def _channel_meant(words: list[str]) -> str | None:
+    """Our channel (with z for a third axis) that the words of a name mean; None if they mean none."""
     known = set(words)
     finger = "1" if known & LEFT else "2" if known & RIGHT else None
     if finger is None or known & TURNING:
@@ -306,7 +302,7 @@ def _meant(words: list[str]) -> str | None:
 
 
 def words(name: str) -> list[str]:
-    """Words of a name: `finger_left_x_mm` and `LeftForceX1` taken apart, its unit left out."""
+    """Words of a name, such as `finger_left_x_mm` or `LeftForceX1`, without its unit."""
     name = re.sub(r"[\[(]\s*[^\d\])][^\])]*[\])]", "", name)
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
     words = [word for word in re.split(r"[^A-Za-z0-9]+", name.lower()) if word]
@@ -325,11 +321,11 @@ CURRENT = {"current", "amp", "amps"}
 
 
 def propose_gripper(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> str:
-    """A `[gripper]` table as TOML with the units of its columns; empty where the names do not say.
+    """A `[gripper]` table as TOML, with the units of its columns; empty if the names do not tell.
 
-    `entries` are those of `[columns]` or `[topics]` that are proposed already.
+    `entries`: those already proposed for `[columns]` or `[topics]`.
     """
-    named = split(table.names)
+    named = split_names(table.names)
     forces = _by_axis(named, FORCE, TORQUE | MOVING | {"grip", "gripper", "finger"})
     never = FORCE | TORQUE | MOVING | TURN | OPENING - {"gripper"}
     places = _by_axis(named, TOOL, never | {"to", "rel", "relative"}) or _by_axis(named, PLACE, never)
@@ -359,7 +355,7 @@ def propose_gripper(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> s
     mapped = {name: dict(fields) for name, fields in entries.items()}
     for name in used:
         unit = table.units.get(name) or unit_in_name(name)
-        if unit and UNITS.get(known_unit(unit) or "", ("", 1.0))[1] != 1:
+        if unit and UNITS[unit][1] != 1:
             mapped[name] = {"from": name, "unit": unit}
     return "\n".join(lines) + "\n" + (as_toml(mapped, table) if mapped else "")
 
@@ -367,7 +363,7 @@ def propose_gripper(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> s
 def _by_axis(
     named: dict[str, list[str]], wanted: set[str], never: set[str], axes: str = "xyz"
 ) -> dict[str, str]:
-    """Columns by axis of a quantity: the last word ends in the axis."""
+    """Columns of a quantity by axis, the last word that ends in one."""
     found: dict[str, str] = {}
     for name, parts in named.items():
         known = set(parts)

@@ -1,8 +1,8 @@
 """Kinematics of the nominal hand: two planar two-link fingers with absolute link angles.
 
 tip = base + L1 (cos q1, sin q1) + L2 (cos q2, sin q2), per finger; the tip frame never rotates.
-Functions take NumPy arrays to NumPy arrays and JAX arrays to JAX arrays, so that what acts on
-angles or links can be differentiated while records need no compilation.
+Functions take NumPy arrays to NumPy arrays and JAX arrays to JAX arrays, so that effects on angles or links
+can be differentiated while recordings need no compilation.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ def forward(finger: Finger, q: Array) -> Array:
 
 
 def turning(length: Array, q: Array) -> tuple[Array, Array]:
-    """How the far end of each link moves with its angle q (..., links) [rad]: x and y (..., links) [m/rad].
+    """Derivatives of each link's far end by its angle q (..., links) [rad]: x and y (..., links) [m/rad].
 
-    Turned back by a right angle, (y, -x), it is the link itself.
+    Rotated by -90 degrees, (y, -x), it is the link itself.
     """
     xp = _module(q)
     return -length * xp.sin(q), length * xp.cos(q)
@@ -73,7 +73,7 @@ def joint_velocity(finger: Finger, q: Array, velocity: Array) -> Array:
 
 
 def require_reach(finger: Finger, number: int, tip: np.ndarray) -> None:
-    """InputError where a motion `tip` (..., 2) [m] leaves what finger `number` can reach."""
+    """InputError if a motion `tip` (..., 2) [m] leaves the reach of finger `number`."""
     distance = np.hypot(*np.moveaxis(np.asarray(tip) - finger.base, -1, 0))
     nearest, farthest = abs(finger.links[0] - finger.links[1]), sum(finger.links)
     if distance.max() >= farthest or distance.min() <= nearest:

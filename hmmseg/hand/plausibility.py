@@ -1,9 +1,10 @@
-"""What a recording cannot be, recognised by what a hand can do, with the line of `rig.toml` that mends it.
+"""Checks of a recording against the abilities of a hand, each with the line of `rig.toml` that mends it.
 
-A hand is sampled from a few Hz to some 20 kHz, travels less than 3 m, its links do not wind twice around, and
+A hand is sampled at a few Hz to some 20 kHz, travels less than 3 m, its links do not wind twice around, and
 its velocities are the derivatives of its positions. Fingers that hold something press towards each other,
-finger 1 from the left; what is carried up weighs on them. Forces are what a fingertip exerts on the block, so
-a grip has fx1 > 0 and fx2 < 0, and a carry fy1 + fy2 > 0. Nothing is guessed: a finding says what to write.
+finger 1 from the left, and what is lifted weighs on them. Forces are exerted by the fingertip on the block,
+so that a grip has fx1 > 0 and fx2 < 0, and a carry fy1 + fy2 > 0. Nothing is corrected without the user's
+consent.
 """
 
 from __future__ import annotations
@@ -23,21 +24,21 @@ from hmmseg.io.units import Column
 from hmmseg.robust import runs, white_sd
 
 SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
-FASTEST = 2e4  # limit: [Hz]; of what a hand's or a robot's sensors are read at
-ANY_FASTEST = 1e7  # limit: [Hz]; of any recording of things that move
+FASTEST = 2e4  # limit: [Hz]; sampling rate of a hand's or a robot's sensors
+ANY_FASTEST = 1e7  # limit: [Hz]; sampling rate of any recording of motion
 REACH = 3.0  # limit: [m]
 WEAKEST, STRONGEST = 0.02, 1000.0  # limit: [N] of a grip
-STILL = 2e-4  # limit: [m]: travel of a hand that moved nothing
+STILL = 2e-4  # limit: [m]; a hand that travels less moved nothing
 WINDING = 4 * np.pi  # [rad]
 YEAR_1990, YEAR_2100 = 6.3e8, 4.1e9  # physics: [s] since 1970
-SAME = 0.15  # limit: relative: a factor of 1000 or 57.3 differs from 1 by far more
+SAME = 0.15  # limit: relative; factors of 1000 or 57.3 differ from 1 by far more
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that cannot be (`certain`, refused) or is unlikely, and the mapping that mends it.
+    """Something impossible (`certain`, refused) or unlikely, and the mapping that mends it.
 
-    `changes` holds by channel the fields of its entry in `[columns]` (or `[topics]`).
+    `changes`: by channel, the fields of its entry in `[columns]` (or `[topics]`).
     """
 
     channel: str
@@ -48,7 +49,7 @@ class Finding:
 
     @property
     def remedy(self) -> str:
-        """What to write where, in a line."""
+        """The entries to write, and where, in one line."""
         entries = ", ".join(entry_text(name, fields) for name, fields in self.changes.items())
         return f"{entries} under [{self.table}] in rig.toml"
 
@@ -60,50 +61,42 @@ def entry_text(channel: str, fields: dict[str, Any]) -> str:
 
 
 def exchanged(
-    stems: tuple[str, ...], pair: tuple[str, str], trial: Trial, rig: Rig | None
+    stems: tuple[str, ...], pair: tuple[str, str], trial: Trial, rig: Rig
 ) -> dict[str, dict[str, Any]]:
-    """Each channel of one of a pair (of fingers, of axes) from where the other's comes from now.
+    """Entries that exchange the sources of a pair of fingers or axes.
 
-    `stems` are the channels' names with {} for what the pair names.
+    `stems` are the channels' names with {} for what the `pair` names.
     """
-    out: dict[str, dict[str, Any]] = {}
-    for stem in stems:
-        for ours, theirs in (pair, pair[::-1]):
-            name, other = stem.format(ours), stem.format(theirs)
-            if name in trial.channels and other in trial.channels:
-                out[name] = changed(other, rig)[other]
+    pairs = [(stem.format(a), stem.format(b)) for stem in stems for a, b in (pair, pair[::-1])]
+    there = trial.channels.keys()
+    return {ours: changed([theirs], rig)[theirs] for ours, theirs in pairs if {ours, theirs} <= there}
+
+
+def changed(channels: Iterable[str], rig: Rig | None, **change: Any) -> dict[str, dict[str, Any]]:
+    """Entries of channels with a change of `unit`, `sign` or `offset` [SI] on top of what the rig says of
+    them."""
+    out = {}
+    for channel in channels:
+        now = Column() if rig is None else (rig.columns | rig.topics).get(channel, Column())
+        unit, sign = change.get("unit", now.unit), now.sign * change.get("sign", 1)
+        offset = now.offset + change.get("offset", 0.0)
+        fields = {"from": now.source or channel, "unit": unit, "sign": int(sign), "offset": offset}
+        usual = {"unit": None, "sign": 1, "offset": 0}
+        out[channel] = {key: v for key, v in fields.items() if key not in usual or v != usual[key]}
     return out
 
 
-def changed(channel: str, rig: Rig | None, **change: Any) -> dict[str, dict[str, Any]]:
-    """The entry of a channel with this change: what the rig already says of it is kept."""
-    now = Column() if rig is None else (rig.columns | rig.topics).get(channel, Column())
-    fields: dict[str, Any] = {"from": now.source or channel}
-    unit, sign = change.get("unit", now.unit), now.sign * change.get("sign", 1)
-    offset = now.offset + change.get("offset", 0.0)
-    fields |= {} if unit is None else {"unit": unit}
-    fields |= {} if sign == 1 else {"sign": int(sign)}
-    fields |= {} if offset == 0 else {"offset": offset}
-    return {channel: fields}
-
-
-def all_changed(channels: Iterable[str], rig: Rig | None, **change: Any) -> dict[str, dict[str, Any]]:
-    """The same change for several channels."""
-    return {name: fields for each in channels for name, fields in changed(each, rig, **change).items()}
-
-
 def check_clock(trial: Trial, rig: Rig | None, moving: bool = True) -> list[Finding]:
-    """Times in ms, us or ns: by `rate` of the rig, by a date, or because no hand is sampled so slowly.
+    """Times in ms, us or ns: by the rig's `rate`, by a date, or because no hand is sampled so slowly.
 
-    `moving`: of a hand or a robot; other recordings may be slow, and are warned of where times are whole.
+    `moving`: whether it is a hand or a robot; other recordings may be slow, and only whole times are odd.
     """
     period = float(np.median(np.diff(trial.t)))
     stated = None if rig is None else rig.rate
     unit, certain = None, True
     for name, size in (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
-        if stated is not None and 0.5 < period * size * stated < 2:
-            unit = name
-        if YEAR_1990 < trial.t[0] * size < YEAR_2100:
+        as_stated = stated is not None and 0.5 < period * size * stated < 2
+        if as_stated or YEAR_1990 < trial.t[0] * size < YEAR_2100:
             unit = name
     if unit is None and period > 1 / SLOWEST:
         unit = "ms" if period < 500 else "us" if period < 5e5 else "ns"
@@ -113,12 +106,12 @@ def check_clock(trial: Trial, rig: Rig | None, moving: bool = True) -> list[Find
     if unit is None and 1 / period > (FASTEST if moving else ANY_FASTEST):
         problem = f"is sampled at {1 / period:.2g} Hz if it is in s, and nothing moves so fast"
         size = 1e3 ** np.ceil(np.log(1 / FASTEST / period) / np.log(1e3))
-        return [Finding("t", problem, changed("t", rig, unit=float(size)))]
+        return [Finding("t", problem, changed(["t"], rig, unit=float(size)))]
     if unit is not None:
         problem = f"is sampled at {1 / period:.2g} Hz if it is in s"
         if stated is not None:
             problem += f", but rate = {stated:g} in rig.toml"
-        return [Finding("t", f"{problem}: it looks like {unit}", changed("t", rig, unit=unit), certain)]
+        return [Finding("t", f"{problem}: it looks like {unit}", changed(["t"], rig, unit=unit), certain)]
     found = []
     if stated is not None and abs(np.log(period * stated)) > SAME:
         problem = f"is sampled at {1 / period:.4g} Hz, but rate = {stated:g} in rig.toml, which is not used"
@@ -126,13 +119,13 @@ def check_clock(trial: Trial, rig: Rig | None, moving: bool = True) -> list[Find
     if moving and YEAR_1990 < trial.t[0] < YEAR_2100:
         date = np.datetime64(int(trial.t[0]), "s")
         problem = f"counts seconds since 1970 (from {date}), and so will all results"
-        change = changed("t", rig, offset=-float(np.floor(trial.t[0])))
+        change = changed(["t"], rig, offset=-float(np.floor(trial.t[0])))
         found.append(Finding("t", problem, change, certain=False))
     return found
 
 
-def judged(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
-    """Warnings about a trial; InputError for what cannot be."""
+def judge(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
+    """Warnings about a trial; InputError for the first certain finding."""
     warnings = []
     for finding in findings:
         where = f"{trial.file}: column {finding.channel}"
@@ -143,9 +136,9 @@ def judged(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
-    """Positions in mm or cm (no hand travels so far), or far too small."""
-    gripper = None if rig is None else rig.gripper
+def check_lengths(trial: Trial, rig: Rig) -> list[Finding]:
+    """Positions in mm or cm (no hand travels so far), or in km."""
+    gripper = rig.gripper
     names = ("x1", "y1", "x2", "y2") if gripper is None else gripper.position.values()
     travels = {
         name: float(np.nanmax(values) - np.nanmin(values))
@@ -155,27 +148,22 @@ def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
     far = {name: travel for name, travel in travels.items() if travel > REACH}
     if far:
         name, travel = max(far.items(), key=lambda item: item[1])
-        unit, text = length_unit(travel)
+        unit, text = "mm", "mm"
+        if travel < 100:
+            unit, text = ("cm", 'cm (or "in")') if travel < 30 else ("mm", 'mm (or "cm")')
+        elif travel >= 5e3:
+            unit, text = "um", "um"
         problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {text}"
         mended = far if gripper is None else travels  # one sensor has one unit
-        return [Finding(name, problem, all_changed(mended, rig, unit=unit))]
+        return [Finding(name, problem, changed(mended, rig, unit=unit))]
     if travels and max(travels.values()) < STILL:
         name = next(iter(travels))
         problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were in km"
-        return [Finding(name, problem, all_changed(travels, rig, unit="mm"), certain=False)]
+        return [Finding(name, problem, changed(travels, rig, unit="mm"), certain=False)]
     return []
 
 
-def length_unit(travel: float) -> tuple[str, str]:
-    """The likeliest unit of positions that travel so many units, and that with the next likely one."""
-    if travel < 30:
-        return "cm", 'cm (or "in")'
-    if travel < 100:
-        return "mm", 'mm (or "cm")'
-    return ("mm", "mm") if travel < 5e3 else ("um", "um")
-
-
-def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
+def check_angles(trial: Trial, rig: Rig) -> list[Finding]:
     """Joint angles in degrees: no link winds twice around."""
     named = [name for name in ("q11", "q12", "q21", "q22") if name in trial.channels]
     joints = [name for name in named if np.isfinite(trial.channels[name]).any()]
@@ -185,15 +173,15 @@ def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
         return []
     name, value = max(wound.items(), key=lambda item: item[1])
     unit = "deg" if value < 3600 else "mrad"
-    changes = all_changed(joints, rig, unit=unit)
-    as_they = [f"d{each}" for each in joints if abs(scale_to_velocity(trial, each, f"d{each}") - 1) < SAME]
-    changes |= all_changed(as_they, rig, unit=f"{unit}/s")
+    changes = changed(joints, rig, unit=unit)
+    right = [f"d{each}" for each in joints if abs(scale_to_velocity(trial, each, f"d{each}") - 1) < SAME]
+    changes |= changed(right, rig, unit=f"{unit}/s")  # rates that go with the angles are in degrees too
     problem = f"reaches {value:.4g} rad, {value / 2 / np.pi:.0f} turns of a link: it looks like {unit}"
     return [Finding(name, problem, changes)]
 
 
-def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
-    """Velocities that are the positions' derivatives times a factor of units, or with the other sign."""
+def check_velocities(trial: Trial, rig: Rig) -> list[Finding]:
+    """Velocities that are the positions' derivatives times a factor of units, or of the other sign."""
     factors = {"q": ((180 / np.pi, "deg/s"), (1e3, "mrad/s")), "x": ((1e3, "mm/s"), (1e2, "cm/s"))}
     found: dict[str, tuple[float, dict[str, object]]] = {}
     for position, velocity in position_pairs(trial):
@@ -206,12 +194,12 @@ def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
     if not found:
         return []
     name, (slope, _) = next(iter(found.items()))
-    changes = {k: v for each, (_, what) in found.items() for k, v in changed(each, rig, **what).items()}
+    changes = {k: v for each, (_, what) in found.items() for k, v in changed([each], rig, **what).items()}
     text = f"is {slope:.3g} times what {name.removeprefix('d').removeprefix('v')} changes by"
     return [Finding(name, text, changes)]
 
 
-def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:
+def check_forces(trial: Trial, rig: Rig) -> list[Finding]:
     """Forces in mN or kN: no fingertip presses so hard, or holds anything so softly."""
     names = [name for name in FORCE_CHANNELS if name in trial.channels]
     there = [np.abs(v[np.isfinite(v)]) for v in (trial.channels[name] for name in names)]
@@ -220,13 +208,13 @@ def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:
         return []
     unit = "mN" if strongest > 1 else "kN"
     problem = f"reaches {strongest:.3g} N, a fingertip {WEAKEST:g} to {STRONGEST:g} N: it looks like {unit}"
-    return [Finding(names[0], problem, all_changed(names, rig, unit=unit), certain=False)]
+    return [Finding(names[0], problem, changed(names, rig, unit=unit), certain=False)]
 
 
 def scale_to_velocity(trial: Trial, position: str, velocity: str) -> float:
-    """What integrated velocity is to displacement over windows in which the hand moves; nan if unclear.
+    """Slope of integrated velocity over displacement, across windows in which the hand moves; NaN if unclear.
 
-    Windows make noise small against displacement, as a difference of neighbours does not.
+    Windows make noise small against displacement; differences of neighbouring samples would not.
     """
     q, v, t = trial.channels[position], trial.channels[velocity], trial.t
     there = np.isfinite(q) & np.isfinite(v)
@@ -247,7 +235,7 @@ def scale_to_velocity(trial: Trial, position: str, velocity: str) -> float:
     return float((moved * swept).sum() / (moved**2).sum())
 
 
-MORE = 3.0  # limit: a grip is so many times what pads share of a load unequally
+MORE = 3.0  # limit: a grip exceeds what pads share unequally of a load by this factor
 CARTESIAN = ("{}1", "{}2", "v{}1", "v{}2")
 FORCES = ("f{}1", "f{}2")
 
@@ -255,7 +243,7 @@ FORCES = ("f{}1", "f{}2")
 def check_axes(trial: Trial, rig: Rig) -> list[Finding]:
     """Fingers that press against each other, or stand apart, along y in place of x."""
     s = task_space(trial, rig)
-    pressed = _strong(np.fmax(np.abs(s.fx1), np.abs(s.fx2))), _strong(s.fy1 - s.fy2)  # whatever signs of fx
+    pressed = _strong(np.fmax(np.abs(s.fx1), np.abs(s.fx2))), _strong(s.fy1 - s.fy2)  # for any signs of fx
     noise = max(_noise(s.fy1), _noise(s.fy2))
     forces = bool(pressed[1] > max(MORE * pressed[0], 20 * noise))
     gripping = np.abs(s.fy1 - s.fy2 if forces else s.fx1) > pressed[forces] / 2
@@ -274,7 +262,7 @@ def check_axes(trial: Trial, rig: Rig) -> list[Finding]:
 
 
 def _strong(difference: np.ndarray) -> float:
-    """What a grip makes of a difference of forces (num_timesteps,) [N]."""
+    """Magnitude of a difference of forces (num_timesteps,) [N] in a grip: its 95 % quantile."""
     there = np.abs(difference[np.isfinite(difference)])
     return float(np.quantile(there, 0.95)) if there.size else 0.0
 
@@ -289,14 +277,18 @@ MOST = 0.75  # limit: the same where a hold continues after its block has been p
 LIFTED = 0.005  # limit: [m]
 CARTESIAN_STEMS = ("x{}", "y{}", "vx{}", "vy{}", "fx{}", "fy{}")
 JOINT_STEMS = ("q{}1", "q{}2", "dq{}1", "dq{}2", "fx{}", "fy{}")
-BRIEF = 5  # limit: samples: a shorter touch holds nothing
+BRIEF = 5  # limit: samples; a shorter touch is no hold
 
 
 @dataclass(frozen=True)
 class Holds:
-    """Samples (num_timesteps,) in which the fingers press, how high the hand is above each hold's
-    first sample [m], and which samples come before the first touch; whether each hold that moves
-    the hand goes up first.
+    """When the fingers press.
+
+    Attributes:
+        pressed: samples (num_timesteps,) of all holds.
+        height: (num_timesteps,) [m] above the first sample of the hold.
+        before: samples (num_timesteps,) before the first touch.
+        rises: for each hold in which the hand moves, whether it goes up first.
     """
 
     pressed: np.ndarray
@@ -306,7 +298,7 @@ class Holds:
 
 
 def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
-    """Swapped fingers, flipped signs, and weight that is not the block's."""
+    """Swapped fingers, flipped signs, and loads that are no block's weight."""
     s = task_space(trial, rig)
     there = np.isfinite([s.fx1 - s.fx2, s.distance, s.y, s.fy]).all(axis=0)
     if there.sum() < 4 * BRIEF:
@@ -317,7 +309,7 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     if same is not None:
         name = "fx2" if same > 0 else "fx1"
         problem = "fx1 and fx2 push the same way all along, a grip pushes from both sides"
-        return [Finding(name, problem, changed(name, rig, sign=-1))]
+        return [Finding(name, problem, changed([name], rig, sign=-1))]
     holds = find_holds(squeeze, s.y)
     if holds is None:
         return []
@@ -336,9 +328,9 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
 
 
 def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial, rig: Rig) -> list[Finding]:
-    """From the signs of x2 - x1 and fx1 - fx2 in a hold and of the load in a lift (0: unclear).
+    """Judge the signs of x2 - x1 and fx1 - fx2 in holds and of the load in lifts (0: unclear).
 
-    `both_bear` says whether fy1 and fy2 have the same sign in a lift.
+    `both_bear`: whether fy1 and fy2 have the same sign in lifts.
     """
     if apart < 0 and towards < 0:
         problem = "finger 1 holds from the right, finger 2 from the left: the fingers are swapped"
@@ -349,52 +341,52 @@ def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial
         if carried < 0:
             names = FORCE_CHANNELS
             problem = "is negative in a grip and fy1 + fy2 in a lift: forces on the finger, not by it"
-        return [Finding("fx1", problem, all_changed(names, rig, sign=-1))]
+        return [Finding("fx1", problem, changed(names, rig, sign=-1))]
     if apart < 0 and towards > 0 and not rig.jointed:
         problem = "is right of x2 in a grip, but fx1 pushes to the right: positions swapped or x flipped"
         moved = [name for name in ("x1", "vx1", "x2", "vx2") if name in trial.channels]
-        return [Finding("x1", problem, all_changed(moved, rig, sign=-1))]
+        return [Finding("x1", problem, changed(moved, rig, sign=-1))]
     if apart > 0 and towards > 0 and carried < 0 and both_bear:
         problem = "and fy2 are negative in sum while a block is lifted: their signs are flipped"
-        return [Finding("fy1", problem, all_changed(("fy1", "fy2"), rig, sign=-1))]
+        return [Finding("fy1", problem, changed(("fy1", "fy2"), rig, sign=-1))]
     return []
 
 
 def _one_bears(first: float, second: float, idle: float, rig: Rig) -> list[Finding]:
-    """A finger [N] that pulls down in lifts as strongly as the other bears: one sign is flipped."""
+    """One finger's load [N] in lifts cancels the other's: one sign is flipped."""
     if first * second >= 0 or abs(first + second - idle) > 0.2 * abs(first - second):
         return []
     name = "fy1" if first < 0 else "fy2"
     problem = f"pulls down with {abs(min(first, second)):.3g} N in lifts while the other finger bears as much"
-    return [Finding(name, problem, changed(name, rig, sign=-1), certain=False)]
+    return [Finding(name, problem, changed([name], rig, sign=-1), certain=False)]
 
 
 def _downwards(holds: Holds, load: np.ndarray, trial: Trial, rig: Rig) -> list[Finding]:
-    """Holds that all go down first, through what the block stands on: y points down."""
+    """All holds go down first, through the support of the block: y points down."""
     if any(holds.rises) or not holds.rises or rig.jointed:
         return []
     low = holds.pressed & (holds.height < -LIFTED)
     axes = ["y1", "y2"] if float(np.median(load[low])) > 0 else ["y1", "y2", "fy1", "fy2"]
     axes += [name for name in ("vy1", "vy2") if name in trial.channels]
     problem = "every hold first goes down from where it began, through its block's support: y points down"
-    return [Finding("y1", problem, all_changed(axes, rig, sign=-1), certain=False)]
+    return [Finding("y1", problem, changed(axes, rig, sign=-1), certain=False)]
 
 
 def _own_weight(idle: float, lifted: float, grip: float, rig: Rig) -> list[Finding]:
-    """A load in free motion [N] against what a lift adds: the hand's own weight, or no zero taken.
+    """The load in free motion [N] exceeds what a lift adds: the hand's own weight, or forces not zeroed.
 
-    Smaller ones are a bias, which is estimated.
+    A smaller one is a bias, which is estimated.
     """
     if abs(idle) < max(abs(lifted), 0.1 * grip):
         return []
     problem = f"and fy2 sum to {idle:.3g} N before the first touch, a lift adds {lifted:.3g} N"
-    changes = all_changed(("fy1", "fy2"), rig, offset=round(-idle / 2, 4))
+    changes = changed(("fy1", "fy2"), rig, offset=round(-idle / 2, 4))
     problem += ": gravity or an offset is still in the forces"
     return [Finding("fy1", problem, changes, certain=False)]
 
 
 def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
-    """Runs of samples with at least half the usual grip; None where nothing is ever held."""
+    """Runs of samples with at least half the usual grip; None if nothing is ever held."""
     scale = float(np.quantile(np.abs(squeeze), 0.95))
     noise = white_sd(squeeze, 1)
     if scale == 0 or scale < 10 * noise:
@@ -414,18 +406,19 @@ def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
 
 
 def _pushing_alike(common: np.ndarray, squeeze: np.ndarray, load: np.ndarray) -> int | None:
-    """Sign of both fx where they push the same way as strongly and as long as a grip would."""
+    """Sign of both fx where they push the same way as strongly and as long as a grip would; None
+    elsewhere."""
     scale = float(np.quantile(np.abs(common), 0.95))
     noise = white_sd(common, 1)
     strong = np.abs(common) > scale / 2
     if scale < max(10 * noise, 3 * float(np.quantile(np.abs(squeeze), 0.95))):
         return None
     if scale < 0.25 * float(np.quantile(np.abs(load), 0.95)) or not 0.1 < strong.mean() < ALL:
-        return None  # too weak to hold, a touch, or no grip that begins and ends
+        return None  # too weak to hold, a mere touch, or no beginning and end
     return _agreed(common[strong]) or None
 
 
 def _agreed(values: np.ndarray, share: float = ALL) -> int:
-    """The sign that so many samples have, 0 where they disagree."""
+    """The sign of at least `share` of the samples, 0 where they disagree."""
     positive = float((values > 0).mean())
     return 1 if positive >= share else -1 if positive <= 1 - share else 0

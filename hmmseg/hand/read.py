@@ -1,4 +1,4 @@
-"""Recordings as they are read: from any source, mapped, judged, and as the two fingers that a hand has.
+"""Read recordings from any source, map, check and convert them to two fingers.
 
 A long file is read piece by piece, in bounded memory, as often as its rows are needed.
 """
@@ -22,11 +22,11 @@ from hmmseg.hand.plausibility import (
     check_lengths,
     check_signs,
     check_velocities,
-    judged,
+    judge,
 )
-from hmmseg.hand.roll import levelled
-from hmmseg.hand.sensing import SPARSE, check_noise, sensed
-from hmmseg.hand.wrist import check_gripper, from_halves, halved, two_fingers
+from hmmseg.hand.sensing import SPARSE, check_noise, remove_faults
+from hmmseg.hand.signals import remove_roll
+from hmmseg.hand.wrist import check_gripper, is_halved, join_halves, two_fingers
 from hmmseg.io.formats import LOGS, kind_of, pieces_of, read_table, rows_of, split_part
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.table import frame_table
@@ -34,29 +34,29 @@ from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import MIN_SAMPLES, Trial, channels_of, trial_of
 from hmmseg.io.units import Column, source_of
 
-PIECE = 20_000  # numerics: rows of one piece; a piece of 50,000 rows and what is made of it takes 20 MB more
-JUDGED = 50_000  # numerics: rows at the beginning by which a recording's habits are judged
-LONG = 1_000_000  # numerics: rows from which on a recording is read in pieces: 13 columns of it are 100 MB
+PIECE = 20_000  # numerics: rows of one piece; one of 50,000 rows and its results take 20 MB more
+JUDGED = 50_000  # numerics: rows at the beginning by which a long recording is checked
+LONG = 1_000_000  # numerics: rows from which a recording is read in pieces: 13 columns of it are 100 MB
 
 
 def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceTask | None = None) -> Trial:
-    """A recording, read and checked.
+    """Read and check one recording.
 
-    The channels kept are the rig's (joint space, Cartesian or a gripper's), or for a plain ordered
-    task the ones it names (every column but `t` otherwise), taken from the columns or messages
-    that the rig's `[columns]` or `[topics]` map to them.
+    Channels are the rig's (joint space, Cartesian or a gripper's), or those that a plain ordered task names
+    (every column but `t` by default), from the columns or messages to which `[columns]` or `[topics]` map
+    them.
 
     Args:
         source: a file, a pandas or polars DataFrame, or a dict of arrays.
         rig: the hand; a plain ordered task needs none.
-        task: a plain ordered task; none for a task of blocks.
+        task: a plain ordered task; None for a task of blocks.
 
     Returns:
         The trial, in SI units.
 
     Raises:
-        InputError: a file cannot be read, or a hand's recording cannot be as it is (other units, flipped
-            signs, swapped fingers); it says where, and what to write into the rig.
+        InputError: the file cannot be read, or the recording contradicts its description (other units,
+            flipped signs, swapped fingers); it says where, and what to write into the rig.
         ValueError: neither a rig nor a task is given.
     """
     if task is None and rig is None:
@@ -69,28 +69,28 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     table = read(source, theirs)
     trial = trial_of(table, rig, task)
     if task is not None or rig is None:
-        warnings = judged(trial, check_clock(trial, rig, moving=False))
+        warnings = judge(trial, check_clock(trial, rig, moving=False))
         return replace(trial, warnings=(*trial.warnings, *warnings))
-    trial = sensed(trial, rig)
+    trial = remove_faults(trial, rig)
     warnings = check(trial, rig)
-    trial = levelled(trial)
+    trial = remove_roll(trial)
     if rig.gripper is not None:
         trial = two_fingers(trial, rig)
-    elif halved(trial):
-        trial = from_halves(trial, rig)
+    elif is_halved(trial):
+        trial = join_halves(trial, rig)
     return replace(trial, warnings=(*trial.warnings, *warnings))
 
 
 def findings(trial: Trial, rig: Rig) -> list[Finding]:
-    """What is amiss with a trial, up to and with the first thing that cannot be.
+    """Findings about a trial, up to and including the first certain one.
 
-    Units come first: what moves 120 m has no sides.
+    Units are checked first: signs of a hand that travels 120 m mean nothing.
     """
     out: list[Finding] = []
     looks = [check_clock, check_lengths, check_angles, check_velocities, check_forces]
-    if not halved(trial):  # a wrist's force has no sides
+    if not is_halved(trial):  # forces of a wrist have no sides
         forces = [trial.channels[name] for name in FORCE_CHANNELS if name in trial.channels]
-        felt = all(np.mean(np.isnan(force)) < SPARSE for force in forces)  # often enough to judge sides by
+        felt = all(np.mean(np.isnan(force)) < SPARSE for force in forces)  # often enough to judge signs by
         looks += [check_noise, check_axes, check_signs] if felt else [check_noise]
     if rig.gripper is not None:
         looks = [check_clock, check_lengths, check_gripper]
@@ -104,29 +104,29 @@ def findings(trial: Trial, rig: Rig) -> list[Finding]:
 
 
 def check(trial: Trial, rig: Rig) -> tuple[str, ...]:
-    """Warnings about a trial; InputError for what cannot be."""
-    return judged(trial, findings(trial, rig))
+    """Warnings about a trial; InputError for what is impossible."""
+    return judge(trial, findings(trial, rig))
 
 
 def is_long(path: str | Path) -> bool:
-    """Whether a file has so many rows, and is of a kind, that it is read in pieces."""
+    """Whether a file is of a kind, and has so many rows, that it is read in pieces."""
     file, part = split_part(path)
     rows = None if part is not None or file.is_dir() else rows_of(file, kind_of(file))
     return rows is not None and rows >= LONG
 
 
 class LongRecording:
-    """A recording of a hand of two fingers on disk: its times, and any of its rows.
+    """A recording of a hand of two fingers on disk.
 
-    `file`: its path; `t` (num_timesteps,) [s]; `rate`: their median one [Hz]. Rows are read
-    fastest in their order. InputError as `read_trial`.
+    `file`: its path; `t` (num_timesteps,) [s]; `rate`: the median one [Hz]. Reading rows in order is fastest.
+    InputError as in `read_trial`.
     """
 
     def __init__(self, path: str | Path, rig: Rig, piece: int = PIECE) -> None:
         self.path, self.rig, self.piece = Path(path), rig, piece
         self.file = str(path)
         self._origin: int | None = None
-        self._kept: list[tuple[int, Trial]] = []  # pieces in memory, with the number of their first row
+        self._kept: list[tuple[int, Trial]] = []  # pieces in memory, each with the number of its first row
         self._rest: Iterator[Trial] = iter(())
         self.t = np.empty(rows_of(self.path, kind_of(self.path)) or 0)
         row, last = 0, -np.inf
@@ -139,7 +139,7 @@ class LongRecording:
         self.rate = float(1.0 / np.median(np.diff(self.t)))
 
     def rows(self, start: int, stop: int) -> Trial:
-        """The rows start <= i < stop as a trial of their own."""
+        """The rows start <= i < stop as a trial."""
         if not self._kept or self._kept[0][0] > start:
             self._kept, self._rest = [], self._pieces()
         while not self._kept or self._last < stop:
@@ -157,7 +157,7 @@ class LongRecording:
         )  # fmt: skip
 
     def beginning(self) -> Trial:
-        """As many rows as its habits are judged by."""
+        """The rows at the beginning by which the recording is checked."""
         return self.rows(0, min(JUDGED, self.t.size))
 
     @property
@@ -166,11 +166,11 @@ class LongRecording:
         return first + trial.t.size
 
     def _pieces(self) -> Iterator[Trial]:
-        """All pieces in order; times count from the first one's zero."""
+        """All pieces in order, on the clock of the first."""
         names, _ = channels_of(self.rig, None)
         wanted = [source_of(name, self.rig.columns) for name in ("t", *(names or ()))]
         for table in pieces_of(self.path, wanted, self.piece, MIN_SAMPLES):
-            trial = levelled(trial_of(table, self.rig, None, whole=False))
+            trial = remove_roll(trial_of(table, self.rig, None, whole=False))
             if trial.origin is not None:
                 self._origin = trial.origin if self._origin is None else self._origin
                 trial = replace(trial, t=trial.t + (trial.origin - self._origin) * 1e-9)

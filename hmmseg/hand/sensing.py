@@ -1,16 +1,14 @@
-"""Which readings of a hand are none: what a working sensor cannot have read is named and left out.
+"""Remove readings that no working sensor can have taken, and name the faults.
 
-This follows from a model of a sensor. Its readings scatter, so that neighbours repeat each other to the
-last digit as often as elsewhere in the channel and its fellows (the other forces, the other joints);
-they stay within a few times the range of all others; a position moves no farther between two samples than its
-velocity carries it; and they are there about as often as elsewhere in the recording. A run of repeated or of
-missing readings is a fault where its length has next to no chance under that model, so that coarse sensors,
-forces that are held for some samples and recordings without noise pass. What is left out is missing from
-there on, to the segmentation and to the properties alike.
+Model of a working sensor: its readings scatter, so that neighbours are equal to the last digit as rarely as
+elsewhere in the channel and its fellows (the other forces, the other joints); they stay within a few times
+the range of all others; a position moves no farther between two samples than its velocity carries it; and
+readings are missing as rarely as elsewhere in the recording. A run of repeated or missing readings is a
+fault if its length is too improbable under that model, so that coarse sensors, forces held for some samples
+and noiseless recordings pass. Faulty readings become missing, for segmentation and identification alike.
 
-Forces in other units than N do not show in mechanics, as load and inertia scale alike.
-
-Independent knowledge shows them: the sensor's noise where `rig.toml` states it, the weight of grippers.
+Forces in other units than N are invisible to mechanics, as load and inertia scale alike. Independent
+knowledge reveals them: the sensor's noise if `rig.toml` states it, and the usual weight of grippers.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hmmseg.hand.plausibility import Finding, all_changed, check_forces
+from hmmseg.hand.plausibility import Finding, changed, check_forces
 from hmmseg.hand.tool import Tool
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
@@ -27,59 +25,60 @@ from hmmseg.io.units import UNITS
 from hmmseg.levels import SURE
 from hmmseg.robust import robust_sd, runs, white_sd
 
-NEAR = 0.3  # limit: relative; noise is stated to within so much, and units differ by factors of 4 and more
-LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with what hangs below its sensor
+NEAR = 0.3  # limit: relative error of a stated noise; units differ by factors of 4 and more
+LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with everything below its sensor
 USUAL_TOOL = 1.0  # limit: [kg] of one
-WHITE = -0.5  # limit: -0.56 and less is white noise, -0.42 and more what filters leave that make it a tenth
+WHITE = -0.5  # limit: white noise has -0.56 or less; filters that reduce it to a tenth give -0.42 or more
 STRETCH = 25  # numerics: samples
 FORCES = ("mN", "gf", "kgf", "kN")
 
 
 def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
-    """Forces of fingertips whose noise is that of the rig times the size of another unit."""
+    """Fingertip forces whose noise is that of the rig times the size of another unit."""
     names = [name for name in FORCE_CHANNELS if name in trial.channels]
     if rig.noise.force is None or not names or check_forces(trial, rig):
         return []
-    shown = noise_of([trial.channels[name] for name in names])
-    unit, off = _nearest(rig.noise.force / shown) if shown > 0 else ("", np.inf)
-    if off > NEAR or (UNITS[unit][1] > 1 and whiteness([trial.channels[name] for name in names]) > WHITE):
-        return []  # a filter makes noise smaller, too, but neighbours alike
+    forces = [trial.channels[name] for name in names]
+    shown = noise_of(forces)
+    unit, off = _nearest_unit(rig.noise.force / shown) if shown > 0 else ("", np.inf)
+    if off > NEAR or (UNITS[unit][1] > 1 and whiteness(forces) > WHITE):
+        return []  # a filter reduces noise, too, but correlates neighbours
     stated = f"where [noise] force = {rig.noise.force:g} N in rig.toml"
     problem = f"has noise of {shown:.2g} {stated}: it looks like {unit}"
-    return [Finding(names[0], problem, all_changed(names, rig, unit=unit), certain=False)]
+    return [Finding(names[0], problem, changed(names, rig, unit=unit), certain=False)]
 
 
 def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
-    """A line where the tool's inertia is none of a gripper's, or another unit's times the stated one."""
+    """A line if the tool's inertia is no gripper's, or differs from the stated one by the factor of a
+    unit."""
     gripper = rig.wrist
-    found = abs(tool.inertia)
-    stated = gripper.tool_mass
-    likely = LIGHTEST < found < HEAVIEST if stated is None else _nearest(stated / found)[1] > np.log(2)
+    names, inertia, stated = gripper.wrench[:3], abs(tool.inertia), gripper.tool_mass
+    where = f"{trial.file}: columns {', '.join(names)}"
+    likely = LIGHTEST < inertia < HEAVIEST
+    if stated is not None:
+        likely = _nearest_unit(stated / inertia)[1] > np.log(2)
     if likely and tool.weighed and abs(tool.mass / tool.inertia - 1) > NEAR:
-        said = "is stated to weigh" if stated is not None else "weighs, as it turns,"
-        names = ", ".join(gripper.wrench[:3])
-        return (f"{trial.file}: columns {names}: the tool {said} {tool.mass:.3g} kg and moves like one of "
-                f"{tool.inertia:.3g} kg; expected one mass: gains, axes or tool_mass under [gripper] are "
-                "wrong",)  # fmt: skip
+        basis = "is stated to weigh" if stated is not None else "weighs, as it turns,"
+        return (f"{where}: the tool {basis} {tool.mass:.3g} kg and moves like one of {tool.inertia:.3g} kg; "
+                "expected one mass: gains, axes or tool_mass under [gripper] are wrong",)  # fmt: skip
     if likely:
         return ()
-    unit, _ = _nearest((USUAL_TOOL if stated is None else stated) / found)
+    unit, _ = _nearest_unit((USUAL_TOOL if stated is None else stated) / inertia)
     expected = f"{LIGHTEST:g} to {HEAVIEST:g} kg" if stated is None else f"{stated:g} kg in rig.toml"
-    names = gripper.wrench[:3]
-    finding = Finding(names[0], "", all_changed(names, rig, unit=unit))
-    text = f"move a tool of {found:.3g} kg ({expected}): they look like {unit}"
-    return (f"{trial.file}: columns {', '.join(names)} {text}; expected {finding.remedy}",)
+    remedy = Finding(names[0], "", changed(names, rig, unit=unit)).remedy
+    text = f"move a tool of {inertia:.3g} kg ({expected}): they look like {unit}; expected {remedy}"
+    return (f"{where} {text}",)
 
 
-def _nearest(size: float) -> tuple[str, float]:
-    """The unit of force nearest to a size [N], and how far it is off (logarithm)."""
+def _nearest_unit(size: float) -> tuple[str, float]:
+    """The unit of force nearest to a size [N], and the absolute logarithm of their ratio."""
     off = {unit: abs(float(np.log(size / UNITS[unit][1]))) for unit in FORCES}
     unit = min(off, key=lambda name: off[name])
     return unit, off[unit]
 
 
-def _quiet(channels: list[np.ndarray]) -> list[np.ndarray]:
-    """Second differences of the quietest quarter of stretches, as contacts are no noise."""
+def _quiet_differences(channels: list[np.ndarray]) -> list[np.ndarray]:
+    """Second differences in the quietest quarter of stretches, which has no contacts."""
     every = [v[np.isfinite(v)] for v in channels]
     pieces = [
         np.diff(p, 2) for v in every for p in np.array_split(v, max(1, v.size // STRETCH)) if p.size > 2
@@ -89,43 +88,41 @@ def _quiet(channels: list[np.ndarray]) -> list[np.ndarray]:
 
 
 def whiteness(channels: list[np.ndarray]) -> float:
-    """Correlation of neighbouring second differences of noise, -2/3 where it is white."""
-    pieces = _quiet(channels)
+    """Correlation of neighbouring second differences of the noise, -2/3 if it is white."""
+    pieces = _quiet_differences(channels)
     total = sum(float(piece @ piece) for piece in pieces)
     return sum(float(piece[1:] @ piece[:-1]) for piece in pieces) / total if total > 0 else 0.0
 
 
 def noise_of(channels: list[np.ndarray]) -> float:
-    """Standard deviation of one sample's noise: that of the stretch at the end of the quiet quarter."""
-    pieces = _quiet(channels)
+    """Noise standard deviation of one sample, from the noisiest stretch of the quietest quarter."""
+    pieces = _quiet_differences(channels)
     return float(np.sqrt(np.mean(pieces[-1] ** 2) / 6)) if pieces else 0.0
 
 
 CHANCE = 1e-4  # chosen: probability a channel below which a run of repeated or missing readings is a fault
-SCATTERS = (
-    -1 / 3
-)  # numerics: correlation of second differences: -2/3 of white noise, positive of smooth motion
+SCATTERS = -1 / 3  # numerics: correlation of second differences: -2/3 of white noise, positive if smooth
 FAR = 5.0  # limit: ranges of all other readings that one may be off by; an impact is less
-FEW = 0.01  # limit: share of readings that are so far off: of more the others are no rule
+FEW = 0.01  # limit: share of readings that may be so far off; if more are, the others are no standard
 LEAP = 20.0  # limit: noise sds that a step exceeds
-FASTEST = 1.2  # limit: times what the fastest velocity around it covers; a sudden stop is off by half
+FASTEST = 1.2  # limit: times the distance at the fastest velocity nearby; a sudden stop errs by half
 SWEPT = 0.1  # limit: share of a position's range that its velocity covers while it stands still
 MIN_ALIVE = 30  # numerics: readings that determine a channel's own noise
-ROUNDING = 1e-6  # numerics: of a channel's range: less noise is that of arithmetic
-MOST = 200  # numerics: longest runs of a channel that are looked at
+ROUNDING = 1e-6  # numerics: share of a channel's range; less noise is that of arithmetic
+MOST = 200  # numerics: longest runs of a channel that are examined
 LISTED = 3  # look: stretches in a line
-STEPS = 3  # limit: of one encoder; of more it is the hand that moves so (backlash)
-SPARSE = 1 / 3  # limit: share of missing readings that is remarked on
-WHOLE = 0.1  # limit: share of rows that are whole, of which fewer are remarked on
+STEPS = 3  # limit: of one encoder; more are motion of the hand (backlash)
+SPARSE = 1 / 3  # limit: share of missing readings from which they are reported
+WHOLE = 0.1  # limit: share of complete rows below which that is reported
 PAUSE, USUAL = 0.6, 5.0  # limit: s, in which a subtask may hide, and usual intervals: a jump of the clock
 CARTESIAN = ("x1", "y1", "x2", "y2")
 
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that a channel shows and no working sensor does.
+    """Something in a channel that no working sensor shows.
 
-    `spans`: stretches [s] whose readings are left out; none where it is only remarked on.
+    `spans`: stretches [s] whose readings are removed; none if it is only reported.
     """
 
     channel: str
@@ -134,43 +131,43 @@ class Fault:
 
     @property
     def line(self) -> str:
-        """What is wrong, and when."""
+        """What is wrong, and when, in one line."""
         listed = [f"{a:.2f} to {b:.2f} s" for a, b in self.spans[:LISTED]]
         more = f" and {len(self.spans) - LISTED} more times" if len(self.spans) > LISTED else ""
         when = f" from {', '.join(listed)}{more}" if listed else ""
         return f"{self.channel} {self.problem}{when}"
 
 
-def sensed(trial: Trial, rig: Rig) -> Trial:
-    """The trial without readings that are none, its faults named in `faults` and `warnings`."""
+def remove_faults(trial: Trial, rig: Rig) -> Trial:
+    """The trial without faulty readings; faults are named in `faults` and `warnings`."""
     channels = {name: values.copy() for name, values in trial.channels.items()}
-    found, kinds, steps = _missing(trial), _kinds(trial, rig), np.diff(trial.t)
+    found, kinds, steps = _find_gaps(trial), _group_channels(trial, rig), np.diff(trial.t)
     wide = np.flatnonzero(steps > max(PAUSE, USUAL * float(np.quantile(steps, 0.95))))
     usual = f"rows are {float(np.median(steps)):.2g} s apart: rows are missing, or the clock was set"
     found += [Fault("t", f"jumps by {steps[i]:.3g} s at {trial.t[i]:.2f} s, where {usual}")
               for i in wide[:LISTED]]  # fmt: skip
     for names, _ in kinds:
         for name in names:
-            found += _far_off(name, trial.t, channels[name])
+            found += _remove_outliers(name, trial.t, channels[name])
     seen = {name: values.copy() for name, values in channels.items()}
     rates = dict(position_pairs(trial))
     for names, noise in kinds:
         for name in names:
-            fault, stuck = _repeated(name, trial.t, seen, names, noise, rates.get(name))
+            fault, stuck = _find_repeats(name, trial.t, seen, names, noise, rates.get(name))
             channels[name][stuck] = np.nan
             found += [] if fault is None else [fault]
-    still = [rate for rate in rates.values() if _reach(seen[rate]) == 0]
-    if still and len(still) == len(rates) and any(_lives(seen[name]) for name in rates):
+    still = [rate for rate in rates.values() if _range(seen[rate]) == 0]
+    if still and len(still) == len(rates) and not all(_rests(seen[name]) for name in rates):
         found.append(Fault(", ".join(still), "stand still though positions move, and are left out"))
         channels |= {rate: np.full(trial.t.size, np.nan) for rate in still}
-    found += _leaps(trial.t, channels, rates)
+    found += _remove_leaps(trial.t, channels, rates)
     trial = replace(trial, channels=channels)
     lines = tuple(f"{trial.file}: {fault.line}" for fault in found)
     return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
 
 
-def _kinds(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
-    """Channels by what they measure, as each is judged by its fellows, and the noise that the rig states."""
+def _group_channels(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
+    """Channels grouped by quantity, as each is compared with its fellows, and the noise stated by the rig."""
     noise = rig.noise
     if rig.gripper is not None:
         g = rig.gripper
@@ -184,8 +181,8 @@ def _kinds(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
     return [(names, sd) for names, sd in there if names]
 
 
-def _far_off(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
-    """Few readings that lie far beyond the range of all others; they are set to NaN in `values`."""
+def _remove_outliers(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
+    """The few readings far beyond the range of all others, which are set to NaN in `values`."""
     there = np.flatnonzero(np.isfinite(values))
     few = max(1, int(FEW * there.size))
     if there.size < 4 * few:
@@ -202,11 +199,11 @@ def _far_off(name: str, t: np.ndarray, values: np.ndarray) -> list[Fault]:
     return [Fault(name, problem, tuple((float(t[i]), float(t[i])) for i in wild))]
 
 
-def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: list[str],
+def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: list[str],
               stated: float | None, rate: str | None) -> tuple[Fault | None, np.ndarray]:  # fmt: skip
-    """Runs of one value that a working sensor cannot have read, and which samples (num_timesteps,) they are.
+    """Runs of one value that a working sensor cannot have read, and their samples (num_timesteps,).
 
-    `fellows`: channels of its kind, itself among them; `stated`: noise of one reading; `rate`: the channel of
+    `fellows`: channels of its kind, itself included; `stated`: noise of one reading; `rate`: the channel of
     its velocity.
     """
     values = seen[name]
@@ -219,12 +216,12 @@ def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: li
     other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
     for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
         value, at = float(shown[start]), there[start : stop + 1]
-        # Where the other finger's force is exactly zero as well, sensors hide what is small.
+        # If the other finger's force is exactly zero as well, the sensors suppress small readings.
         if stop - start < 2 or (value == 0 and other is not None and np.mean(other[at] == 0) > 0.5):
             continue
         chance = _chance_of_repeat(name, value, at, seen, fellows, stated)
-        unlikely = np.log(shown.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
-        if unlikely or (rate is not None and _swept(at, t, values, seen[rate])):
+        unlikely = _unlikely(stop - start, chance, shown.size)
+        if unlikely or (rate is not None and _is_swept(at, t, values, seen[rate])):
             stuck[at] = True
             standing.setdefault(value, []).append((float(t[at[0]]), float(t[at[-1]])))
     if not standing:
@@ -240,57 +237,57 @@ def _repeated(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows: li
     return Fault(name, f"{problem}, and is left out", every), stuck
 
 
-def _swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
-    """Whether a velocity that lives carries a position far while that repeats itself (samples `at`)."""
+def _is_swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarray) -> bool:
+    """Whether a live velocity carries a position far while the position repeats itself (samples `at`)."""
     known = rate[at][np.isfinite(rate[at])]
     if known.size < MIN_ALIVE // 3 or _rests(rate, at):
         return False
     v, steps = np.nan_to_num(rate[at]), np.diff(t[at])
     way = float(np.ptp(np.cumsum(steps * (v[1:] + v[:-1]) / 2)))
     by_noise = white_sd(known, 1) * float(np.median(steps)) * np.sqrt(steps.size)
-    return bool(way > max(SWEPT * _reach(values), SURE * by_noise))
+    return bool(way > max(SWEPT * _range(values), SURE * by_noise))
 
 
 def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
                       fellows: list[str], stated: float | None) -> float:  # fmt: skip
-    """How likely a reading repeats the one before: as often as others of the channel and its fellows do.
+    """Probability that a reading repeats the one before: how often others of the channel and its fellows do.
 
-    1 where readings do not scatter, as far as they and the rig show, or a hand waits.
+    1 if readings do not scatter, as far as they and the rig show, or the hand waits.
     """
     own = np.where(seen[name] == value, np.nan, seen[name])
     others = [seen[fellow] for fellow in fellows if fellow != name]
-    alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if _lives(v)]
+    alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if not _rests(v)]
     waits = all(_rests(v, at) for v in others)
-    scatter = whiteness(alive) <= SCATTERS or (stated is not None and not waits)  # else there is no noise
-    if not any(_reach(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
+    scatter = whiteness(alive) <= SCATTERS or (stated is not None and not waits)
+    if not any(_range(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
         return 1.0
     differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
     pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
     return (repeats + 1) / (pairs + 2)
 
 
-def _lives(values: np.ndarray) -> bool:
-    """Whether a channel does more than repeat itself."""
-    return not _rests(values)
+def _unlikely(length: int, chance: float, count: int) -> bool:
+    """Whether a run of `length` samples, each of this chance, is too improbable anywhere among `count`."""
+    return bool(np.log(count) + length * np.log(chance) < np.log(CHANCE))
 
 
 def _rests(values: np.ndarray, at: np.ndarray | slice = slice(None)) -> bool:
-    """Whether a stretch of a channel mostly repeats itself, but for rounding."""
+    """Whether (a stretch of) a channel mostly repeats itself, up to rounding."""
     stretch = values[at]
     steps = np.diff(stretch[np.isfinite(stretch)])
-    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * _reach(values)) > 0.5)
+    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * _range(values)) > 0.5)
 
 
-def _reach(values: np.ndarray) -> float:
-    """How far a channel's readings go apart, 0 of none."""
+def _range(values: np.ndarray) -> float:
+    """Range of a channel's readings, 0 of none."""
     there = values[np.isfinite(values)]
     return float(np.ptp(there)) if there.size else 0.0
 
 
-def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
-    """A position that steps as its velocity does not, alone among them; what that leaves open is set to NaN.
+def _remove_leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
+    """A single position that steps as its velocity does not; the samples in doubt are set to NaN.
 
-    Where several positions step, it is the hand that does (backlash).
+    If several positions step, the hand does (backlash).
     """
     stepping = {}
     for name, rate in rates.items():
@@ -298,13 +295,13 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
         if there.size < MIN_ALIVE:
             continue
         q, v, times = channels[name][there], channels[rate][there], t[there]
-        more = np.diff(q) - np.diff(times) * (v[1:] + v[:-1]) / 2
-        near = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(v), 2, mode="edge"), 6).max(axis=1)
-        covered = near * np.diff(times)
-        far = np.abs(more) > np.maximum(LEAP * robust_sd(more), FASTEST * covered)
-        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # no velocity covers a gap
+        excess = np.diff(q) - np.diff(times) * (v[1:] + v[:-1]) / 2
+        fastest = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(v), 2, mode="edge"), 6).max(axis=1)
+        covered = fastest * np.diff(times)
+        far = np.abs(excess) > np.maximum(LEAP * robust_sd(excess), FASTEST * covered)
+        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # velocities do not bridge a gap
         if far.any():
-            stepping[name] = there, np.where(far, more, 0.0)
+            stepping[name] = there, np.where(far, excess, 0.0)
     if len(stepping) != 1:
         return []
     name, (there, steps) = next(iter(stepping.items()))
@@ -313,7 +310,7 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
         return []
     away = np.abs(offset) > np.abs(steps[at]).min() / 2
     problem = f"jumps by {steps[at[0]]:.3g} at {t[there[at[0] + 1]]:.2f} s, as its velocity does not"
-    if away[-1]:  # it never comes back: either side may be the right one
+    if away[-1]:  # it never comes back: either side may be wrong
         first, last, why = 0, t.size - 1, ": which side is right nothing tells, so it is left out"
     else:
         first, last, why = there[away][0], there[away][-1], ", and is left out"
@@ -321,16 +318,15 @@ def _leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]
     return [Fault(name, problem + why, ((float(t[first]), float(t[last])),))]
 
 
-def _missing(trial: Trial) -> list[Fault]:
-    """Channels with few readings, or none for longer than elsewhere in them, and rows hardly ever whole."""
+def _find_gaps(trial: Trial) -> list[Fault]:
+    """Channels with few readings or long gaps, and rows that are hardly ever complete."""
     gone = {name: ~np.isfinite(values) for name, values in trial.channels.items()}
     out = []
     for name, lost in gone.items():
         share, long = float(lost.mean()), []
         for start, stop in runs(lost):
             chance = (lost.sum() - (stop - start) + 1) / (lost.size - (stop - start) + 2)
-            unlikely = np.log(lost.size) + (stop - start) * np.log(chance) < np.log(CHANCE)
-            if unlikely and trial.t[stop - 1] - trial.t[start] > PAUSE:
+            if _unlikely(stop - start, chance, lost.size) and trial.t[stop - 1] - trial.t[start] > PAUSE:
                 long.append((float(trial.t[start]), float(trial.t[stop - 1])))
         if long:
             out.append(Fault(name, "has no readings", tuple(long)))

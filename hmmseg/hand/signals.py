@@ -1,12 +1,18 @@
 """Task-space signals of a two-finger hand (paper, Section 3.3) and their sample noise.
 
-Fingers are x1, y1, ... (left) and x2, y2, ... (right); the object sees their means and
-differences. Positions are the undeformed contact faces, forces what a fingertip exerts.
+Fingers are x1, y1, ... (left) and x2, y2, ... (right); the object sees their means and differences. Positions
+are the undeformed contact faces, forces are exerted by the fingertips.
 
-Velocities that a drive makes of its own positions, and so come late.
+Velocities that a drive computes from its own positions come late. Without a tachometer,
 
-A drive without a tachometer gives v[k] = (x[k] - x[k-m]) / (t[k] - t[k-m]): the velocity of m / 2 samples
-ago, with the positions' own noise. At 20 Hz that is 25 ms, more than a contact change may be wrong by.
+    v[k] = (x[k] - x[k-m]) / (t[k] - t[k-m])
+
+is the velocity m / 2 samples ago, with the positions' noise. At 20 Hz that is 25 ms, more than the admissible
+error of a contact change.
+
+The fingers of one gripper, and what they hold, may roll together about their midpoint. Given as the column
+`hand_roll` [rad] (counterclockwise, 0 where the fingers are level), a roll is removed as the recording is
+read: differences between the fingers are rotated back; their mean position and the sum of their forces stay.
 """
 
 from __future__ import annotations
@@ -15,23 +21,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hmmseg.contact.equations import turned
+from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import forward, jacobian
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
-from hmmseg.io.trial import Trial, position_pairs
+from hmmseg.io.trial import ROLL, Trial, position_pairs
 from hmmseg.robust import bridged
 from hmmseg.tables import Brief
 
+STEEPEST = 0.5  # limit: rad; a hand rolled further holds no upright block (and degrees are larger)
+
 
 def group_size(rate: float, max_rate: float) -> int:
-    """How many samples at `rate` [Hz] become one at no more than `max_rate`."""
+    """How many samples at `rate` [Hz] make one at `max_rate` or less."""
     return int(np.ceil(rate / max_rate - 1e-6))
 
 
 def grouped(values: np.ndarray, group: int, width: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Means (M, ...) over each `group` of samples of values (N, ...), and how many values each is of.
+    """Means (M, ...) over each `group` of samples of values (N, ...), and the number of values in each.
 
-    Of a group only the first `width` samples count, all by default; what is left over at the end is left out,
-    and a mean of nothing is NaN.
+    Only the first `width` samples of a group count, all by default. An incomplete last group is dropped, and
+    the mean of no values is NaN.
     """
     width = group if width is None else width
     starts = np.arange(0, len(values) - width + 1, group)
@@ -46,8 +56,8 @@ def grouped(values: np.ndarray, group: int, width: int | None = None) -> tuple[n
 class Signals(Brief):
     """Fingertip signals of one trial, arrays (num_timesteps,), NaN where missing.
 
-    Positions [m], velocities [m/s] and forces [N]; `sd_*` are the standard deviations of one
-    sample's noise, NaN where the rig does not state them.
+    Positions [m], velocities [m/s] and forces [N]; `sd_*` are noise standard deviations of one sample, NaN
+    where the rig does not state them.
     """
 
     t: np.ndarray
@@ -69,9 +79,9 @@ class Signals(Brief):
     sd_vy: np.ndarray
     sd_force: float
     derived: bool = False  # velocities are differences of positions
-    touches: tuple[tuple[float, float], ...] = ()  # times of touch and release known apart, and sds [s]
-    timing: np.ndarray | None = None  # sd of when a force changed that changes there [s]
-    free: np.ndarray | None = None  # share of a sample in which nothing is held for sure
+    touches: tuple[tuple[float, float], ...] = ()  # known times of touch and release, and their sds [s]
+    timing: np.ndarray | None = None  # sd of the time at which a force changes [s]
+    free: np.ndarray | None = None  # share of a sample in which surely nothing is held
 
     @property
     def x(self) -> np.ndarray:
@@ -165,7 +175,7 @@ def _square(sd: float | None) -> float:
 
 
 def central_differences(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Central differences over the samples that are there, and the time [s] each spans.
+    """Central differences over the samples that are present, and the time [s] that each spans.
 
     NaN where the sample is missing.
     """
@@ -178,19 +188,19 @@ def central_differences(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, 
 
 
 SPAN = 0.01  # chosen: s; fingers change their speed over some hundredths of a second
-LONGEST = 4  # chosen: samples that such a difference spans at most
-# numerics: what rounding leaves, against what a velocity of its own differs by from any difference
+LONGEST = 4  # chosen: samples that a drive's difference spans at most
+# numerics: residual of velocities that repeat such differences, up to rounding, over that of independent ones
 ALIKE = 0.1
 
 
 def timely(signals: Signals, trial: Trial, rig: Rig) -> Signals:
-    """The signals with central differences for velocities that are late differences of positions, or none."""
+    """The signals with central differences instead of velocities that are late, or missing altogether."""
     dead = any(not np.isfinite(trial.channels[rate]).any() for _, rate in position_pairs(trial))
     return differenced(signals) if dead or come_late(trial, rig) else signals
 
 
 def come_late(trial: Trial, rig: Rig) -> bool:
-    """Whether a trial's velocities are late differences of its positions."""
+    """Whether a trial's velocities are backward differences of its positions."""
     names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
     rates = [f"d{n}" if rig.jointed else f"v{n}" for n in names]
     pairs = [(trial.channels[n], trial.channels[r]) for n, r in zip(names, rates, strict=True)
@@ -199,7 +209,7 @@ def come_late(trial: Trial, rig: Rig) -> bool:
 
 
 def differenced(signals: Signals) -> Signals:
-    """The signals with central differences of positions for velocities."""
+    """The signals with central differences of positions as velocities."""
     made = {}
     for axis in "xy":
         for i in (1, 2):
@@ -209,7 +219,7 @@ def differenced(signals: Signals) -> Signals:
 
 
 def late_differences(t: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> bool:
-    """Whether velocity (num_timesteps,) repeats the backward differences of position over some samples."""
+    """Whether velocity (num_timesteps,) equals the backward differences of position over some samples."""
     central = _residual(velocity[1:-1], (position[2:] - position[:-2]) / (t[2:] - t[:-2]))
     backward = [
         _residual(velocity[m:], (position[m:] - position[:-m]) / (t[m:] - t[:-m]))
@@ -219,10 +229,11 @@ def late_differences(t: np.ndarray, position: np.ndarray, velocity: np.ndarray) 
 
 
 def one_sided(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Rates (2, num_timesteps) of change just before and just after each sample, from that side alone.
+    """Rates (2, num_timesteps) of change just before and just after each sample, and their relative noise
+    [1/s].
 
-    A difference across a touch is of neither side. Each is the slope at the end of a parabola through
-    three readings SPAN apart, or a sample's interval. Also their noise over that of a reading [1/s].
+    Each uses samples of its own side, as a difference across a touch belongs to neither: the slope at the end
+    of a parabola through three readings SPAN (or a sample interval) apart.
     """
     there = np.isfinite(values)
     h = max(SPAN, float(np.median(np.diff(t))))
@@ -239,17 +250,17 @@ def one_sided(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def _residual(velocity: np.ndarray, difference: np.ndarray) -> float:
-    """Mean absolute residual [m/s or rad/s], infinite of none."""
+    """Mean absolute residual [m/s or rad/s], infinite if there is none."""
     apart = np.abs(velocity - difference)
     apart = apart[np.isfinite(apart)]
     return float(apart.mean()) if apart.size else np.inf
 
 
 def with_heights(signals: Signals, trial: Trial, rig: Rig) -> Signals:
-    """The signals with heights wherever coordinates can be interpolated over time.
+    """The signals with heights wherever the coordinates can be interpolated over time.
 
-    A height takes four link angles. Where two readings in five are missing, all four are there in one sample
-    of eight. Only for what a fraction of a hand's way decides: an interpolated height has its own error.
+    A height takes four link angles: if two readings in five are missing, all four are present in one sample
+    of eight. Only for decisions about a fraction of the hand's travel, as interpolation has its own error.
     """
     names = ("q11", "q12", "q21", "q22") if rig.jointed else ("y1", "y2")
     known = {name: np.isfinite(trial.channels[name]) for name in names}
@@ -258,3 +269,49 @@ def with_heights(signals: Signals, trial: Trial, rig: Rig) -> Signals:
     filled = {name: bridged(trial.channels[name], trial.t) for name in names}
     whole = task_space(replace(trial, channels=trial.channels | filled), rig)
     return replace(signals, y1=whole.y1, y2=whole.y2, sd_y=whole.sd_y)
+
+
+def remove_roll(trial: Trial) -> Trial:
+    """A Cartesian trial as it would have been recorded had the hand not rolled.
+
+    InputError for a roll at which no hand holds an upright block.
+    """
+    if ROLL not in trial.channels:
+        return trial
+    roll = trial.channels[ROLL]
+    beyond = np.flatnonzero(np.abs(np.nan_to_num(roll)) > STEEPEST)
+    if beyond.size:
+        where = f"{trial.file}: sample {beyond[0] + 1}, column {ROLL}"
+        expected = (
+            f"radians, 0 where the fingers are level, at most {STEEPEST:g} either way (is it in degrees?)"
+        )
+        raise InputError(where, f"{roll[beyond[0]]:.3g} rad", expected)
+    roll = bridged(roll, trial.t)
+    c = dict(trial.channels)
+    roll_rate = np.gradient(roll, trial.t)
+    level: tuple[np.ndarray, np.ndarray] | None = None
+    for kind in ("", "v", "f"):
+        names = [[f"{kind}{axis}{i}" for axis in "xy"] for i in (1, 2)]
+        if not all(name in c for pair in names for name in pair):
+            continue
+        (x1, y1), (x2, y2) = ((c[x], c[y]) for x, y in names)
+        across, up = turned(x2 - x1, y2 - y1, -roll)
+        if kind == "":
+            level = across, up
+        if kind == "v" and level is not None:  # velocity of the rotating frame
+            across, up = across + roll_rate * level[1], up - roll_rate * level[0]
+        for sign, (x, y) in zip((-0.5, 0.5), names, strict=True):
+            c[x], c[y] = (x1 + x2) / 2 + sign * across, (y1 + y2) / 2 + sign * up
+    return replace(trial, channels=c)
+
+
+def level_row(row: np.ndarray, roll: float) -> np.ndarray:
+    """One row (12,) of CARTESIAN_CHANNELS as it would be had the hand not rolled by `roll` [rad].
+
+    Velocities are only rotated: the rotating frame's contribution only makes the fingers differ.
+    """
+    first, second = row.reshape(2, 3, 2)  # positions, velocities and forces: across, up
+    across, up = turned(second[:, 0] - first[:, 0], second[:, 1] - first[:, 1], -roll)
+    half = np.stack([across, up], axis=1) / 2
+    middle = (first + second) / 2
+    return np.concatenate([middle - half, middle + half]).ravel()

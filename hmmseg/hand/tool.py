@@ -1,17 +1,16 @@
-"""The tool that hangs on a wrist sensor, and what it does to the world once its own share is taken out.
+"""The tool that hangs on a wrist sensor, and the force that it exerts once its own share is removed.
 
-With F what the sensor reads, R the turn from the tool's axes to the world's, a and v the acceleration and
-velocity of the tool, g gravity and f what the tool does to its environment, in its axes,
+With F the sensor's reading, R the rotation from the tool's axes to the world's, a and v the acceleration and
+velocity of the tool, g gravity and f the force of the tool on its environment in the tool's axes,
 
     F = b + Q (m_a R^T (a + tau da/dt) - m R^T g + d R^T v + f),
 
-b the sensor's offset, m the tool's mass, d the drag of cables and hoses, and Q the axes of the sensor, with
-det Q = -1 where it reads the reaction. tau is by how much later than the wrench the pose was taken. m_a is
-m for a rigid tool; gears that spin with the arm make it appear larger, so it is found apart. In free motion
-f = 0, so all of them follow from how F goes with the motion (robust least squares; Q by Kabsch's 1976
-solution of the orthogonal Procrustes problem). An arm that never turns its hand tells b only together with
-the tool's weight, which does not matter: it is the same
-throughout.
+where b is the sensor's offset, m the tool's mass, d the drag of cables and hoses, Q the axes of the sensor,
+with det Q = -1 if it reads the reaction, and tau the delay of the pose behind the wrench. m_a is m for a
+rigid tool; gears that spin with the arm make it appear larger, so it is fitted separately. In free motion f
+= 0, and the regression of F on the motion gives all of them (robust least squares; Q by Kabsch's 1976
+solution of the orthogonal Procrustes problem). An arm that never turns its hand shows only the sum of b and
+the tool's weight, which suffices, as the weight is then constant.
 """
 
 from __future__ import annotations
@@ -28,18 +27,19 @@ from hmmseg.levels import SURE, TAIL
 from hmmseg.robust import bridged, robust_sd, white_sd
 
 WINDOW, WIDEST = 0.1, 0.4  # chosen: s over which motion is smoothed: arms change no faster
-LEAST = 3  # numerics: samples of the same: what a parabola needs
-QUIET = 0.1  # chosen: m/s^2; the window widens until the acceleration's noise is less: a hundredth of gravity
+LEAST = 3  # numerics: samples in the window: what a parabola needs
+QUIET = 0.1  # chosen: m/s^2 (a hundredth of gravity); the window widens until acceleration is less noisy
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Motion of the pads' middle in the world at t (num_timesteps,) [s].
+    """Motion of the midpoint of the pads, in the world, at t (num_timesteps,) [s].
 
-    `position`, `velocity`, `acceleration` (num_timesteps, 3) [m, m/s, m/s^2], the latter two smoothed
-    over `window` [s]; `turned` (num_timesteps, 3, 3): from the
-    tool's axes to the world's; `up`, `across` (3,): unit vectors against gravity and, horizontally,
-    along the closing.
+    Attributes:
+        position, velocity, acceleration: (num_timesteps, 3) [m, m/s, m/s^2], the latter two smoothed.
+        turned: (num_timesteps, 3, 3) rotation from the tool's axes to the world's.
+        up, across: (3,) unit vectors against gravity, and horizontally along the closing.
+        window: [s] of the smoothing.
     """
 
     t: np.ndarray
@@ -53,9 +53,9 @@ class Pose:
 
 
 def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose:
-    """Pose in every sample, gaps bridged; InputError where it cannot be had.
+    """Pose at every sample, with gaps bridged; InputError if it cannot be determined.
 
-    `window` [s]: over which to smooth; as wide as the noise wants where it is not given.
+    `window` [s] of the smoothing; by default as wide as the noise requires.
     """
     t, n = trial.t, trial.t.size
     position = np.zeros((n, 3))
@@ -70,8 +70,8 @@ def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose
         where = f"{trial.file}: [gripper] closing"
         problem = f"the pads close along {gripper.closing}, which is mostly up and down"
         raise InputError(where, problem, "the axis along which they close, and a quaternion x, y, z, w")
-    if window is None:  # as wide as leaves little noise in the acceleration
-        # Of a parabola through n samples the second derivative's variance is 720 s^2 / (n^5 dt^4).
+    if window is None:
+        # The second derivative of a parabola through n samples has the variance 720 s^2 / (n^5 dt^4).
         period, sd = float(np.median(np.diff(t))), max(white_sd(c) for c in position.T)
         needed = (720 * sd**2 / period**4 / QUIET**2) ** 0.2 * period
         window = float(np.clip(needed, WINDOW, WIDEST))
@@ -80,6 +80,7 @@ def pose_of(trial: Trial, gripper: Gripper, window: float | None = None) -> Pose
 
 
 def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
+    """Rotations (num_timesteps, 3, 3) from the tool's axes to the world's."""
     from scipy.spatial.transform import Rotation  # slow to import
 
     t = trial.t
@@ -94,7 +95,7 @@ def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
         if not there.any():
             raise InputError(f"{trial.file}: column {gripper.quaternion[0]}", "has no complete quaternion")
         signs = np.cumprod(np.r_[1.0, np.where((q[there][1:] * q[there][:-1]).sum(axis=1) < 0, -1, 1)])
-        q[there] *= signs[:, None]  # q and -q turn alike: no jumps between them
+        q[there] *= signs[:, None]  # q and -q are one rotation: no jumps between them
         q[~there] = np.nan
         return Rotation.from_quat(np.stack([bridged(c, t) for c in q.T], axis=1)).as_matrix()
     if gripper.rotation_vector is not None:
@@ -116,16 +117,15 @@ def _turned(trial: Trial, gripper: Gripper) -> np.ndarray:
 def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WINDOW) -> np.ndarray:
     """Local parabolas through values (num_timesteps, ...) over `window` s, or their derivative.
 
-    Savitzky and Golay 1964, Anal. Chem. 36; samples that are not evenly spaced are read as if on the
-    even grid of as many.
+    Savitzky and Golay 1964, Anal. Chem. 36. Unevenly spaced samples are interpolated onto an even grid.
     """
     flat = values.reshape(len(t), -1)
     even = np.linspace(t[0], t[-1], len(t))
     period = float(even[1] - even[0])
     length = max(LEAST, round(window / period) // 2 * 2 + 1)
     length = min(length, (len(t) - 1) // 2 * 2 + 1)
-    # As scipy.signal.savgol_filter, whose import takes half a second: the first and the last half of `length`
-    # are on the first and the last parabola.
+    # As scipy.signal.savgol_filter, whose import takes half a second: values in the first and the last half
+    # window lie on the first and the last parabola.
     half = length // 2
     steps = np.vander(np.arange(-half, half + 1), 3, increasing=True)
     fit = np.linalg.pinv(steps)
@@ -140,20 +140,26 @@ def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WI
     return np.stack(out, axis=1).reshape(values.shape)
 
 
-ROUNDS = 20  # numerics: of an iteration that settles sooner
-TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less shows nothing of its weight and centre
-SAMPLES = 20  # numerics: of free motion, at least
+ROUNDS = 20  # numerics: iterations of the robust fit, which converges sooner
+TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less does not show its weight
+SAMPLES = 20  # numerics: least samples of free motion
 
 
 @dataclass(frozen=True)
 class Tool:
-    """The tool as free motion shows it: `axes` Q (3, 3), `offset` and `drift` (3,) [N, N/s].
+    """The tool, from free motion.
 
-    `shares` (4,): what goes with the acceleration (inertia) [kg], with the weight [kg] (0 unless `weighed`:
-    apart from the offset), with the velocity (drag) [N s/m] and with how the acceleration changes [kg s],
-    which is by how much later than the wrench the pose was taken, times the inertia; `noise` [N]: scale of
-    one component of F in free motion about the model; `since` [s]: when the drift has added nothing to the
-    offset, `drift_sd` [N/s]: its standard error; `against`: the reading goes against a stated sign.
+    Attributes:
+        axes: Q (3, 3).
+        shares: (4,) coefficients of the acceleration (inertia) [kg], of the weight [kg] (0 unless
+            `weighed`), of the velocity (drag) [N s/m] and of the jerk [kg s] (inertia times the delay of the
+            pose).
+        weighed: whether the weight was separated from the offset.
+        offset, drift: (3,) of the sensor [N, N/s].
+        noise: scale of one component of F in free motion about the model [N].
+        since: time at which the drift is zero [s].
+        drift_sd: standard error of the drift [N/s].
+        against: whether the reading contradicts the stated sign.
     """
 
     axes: np.ndarray
@@ -168,21 +174,21 @@ class Tool:
 
     @property
     def inertia(self) -> float:
-        """Its mass by acceleration [kg]."""
+        """Its mass by inertia [kg]."""
         return float(self.shares[0])
 
     @property
     def mass(self) -> float:
-        """Its mass by weight [kg], or by acceleration where the weight goes into the offset."""
+        """Its mass by weight [kg], or by inertia if the weight is part of the offset."""
         return float(self.shares[1] if self.weighed else self.shares[0])
 
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """Samples of free motion at `t` (n,) [s]: smoothed readings `force` (n, 3) [N] and what they go with.
+    """Samples of free motion at `t` (n,) [s]: smoothed readings and their regressors.
 
-    `terms` (4, n, 3): acceleration, minus gravity, velocity and jerk in the axes that the wrench is given in
-    or turns with; `window` [s]: samples nearer to each other than this are no two.
+    `force` (n, 3) [N]; `terms` (4, n, 3): acceleration, minus gravity, velocity and jerk, in the axes of the
+    wrench up to a constant rotation; `window` [s]: samples nearer to each other are not independent.
     """
 
     t: np.ndarray
@@ -192,27 +198,22 @@ class FreeMotion:
 
 
 def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
-    """Forces (num_timesteps, 3) as the sensor reads them [N], NaN where missing."""
+    """Forces (num_timesteps, 3) as read by the sensor [N], NaN where missing."""
     return np.stack([trial.channels[name] for name in gripper.wrench[:3]], axis=1)
 
 
-def _in_tool(pose: Pose, gripper: Gripper, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (num_timesteps, 3) of the world in the axes that the wrench is given in or turns with."""
-    if gripper.frame == "world":
-        return vectors
-    return np.einsum("tji,tj->ti", pose.turned, vectors)
-
-
 def _terms(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
-    """Acceleration, minus gravity, velocity and jerk (4, num_timesteps, 3) in those axes."""
+    """Acceleration, minus gravity, velocity and jerk (4, num_timesteps, 3), as in `FreeMotion.terms`."""
     weight = np.broadcast_to(gravity * pose.up, pose.acceleration.shape)
     jerk = np.gradient(pose.acceleration, pose.t, axis=0)
     every = (pose.acceleration, weight, pose.velocity, jerk)
-    return np.stack([_in_tool(pose, gripper, v) for v in every])
+    if gripper.frame != "world":
+        every = tuple(np.einsum("tji,tj->ti", pose.turned, vectors) for vectors in every)
+    return np.stack(every)
 
 
 def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMotion:
-    """What samples `free` (num_timesteps,) of a trial say of its tool."""
+    """Regressors of the samples `free` (num_timesteps,) of a trial."""
     gripper = rig.wrist
     force = np.stack([bridged(c, trial.t) for c in wrench_of(trial, gripper).T], axis=1)
     force = smooth(trial.t, force, window=pose.window)[free]
@@ -220,22 +221,23 @@ def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMot
 
 
 def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
-    """The tool from free motion, samples `free` (num_timesteps,); InputError where it is undetermined."""
+    """The tool from samples `free` (num_timesteps,) of free motion; InputError if they do not determine
+    it."""
     return tool_of(trial.file, rig, free_motion(trial, rig, pose, free), float(trial.t.mean()))
 
 
 def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool = True) -> Tool:
-    """The tool; InputError where free motion says nothing, or another rig.
+    """The tool; InputError if free motion does not determine it.
 
-    `between`: what is to be read lies between samples of free motion. Else the offset's drift is carried on
-    only where it shows clearly.
+    `between`: whether the tool is used between the samples of free motion. Otherwise a drift of the offset is
+    extrapolated only if it is significant.
     """
     gripper = rig.wrist
     where = f"{file}: columns {', '.join(gripper.wrench[:3])}"
     if motion.t.size < SAMPLES:
         raise InputError(where, "show no free motion to find the tool's own share from",
                          "samples before the first grip and after the last")  # fmt: skip
-    # Smoothed samples within one window go together.
+    # Smoothed samples within one window are not independent.
     together = max(1.0, motion.window / float(np.median(np.diff(motion.t))))
     time = motion.t - since
     axes, found, unit, noise = _fit(rig, motion, time)
@@ -255,10 +257,10 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
 
 def _fit(rig: Rig, motion: FreeMotion, time: np.ndarray
          ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:  # fmt: skip
-    """Axes, what follows along them, its standard errors for unit noise, and the noise.
+    """Axes, coefficients along them, their standard errors for unit noise, and the noise.
 
-    Robust least squares, in turns with the axes, of F in the tool's axes on the four terms (of a hand that
-    does not turn the weight is a part of the offset), the offset (3) and the drift (3).
+    Robust least squares, in turns with the axes, of F in the tool's axes on the four terms (without the
+    weight if the hand does not turn), the offset (3) and the drift (3).
     """
     gripper, terms, n = rig.wrist, motion.terms, motion.t.size
     turns = gripper.turns and gripper.frame != "world" and _spread(terms[1]) > TURNED * rig.gravity
@@ -287,7 +289,8 @@ def _spread(vectors: np.ndarray) -> float:
 
 
 def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.ndarray) -> np.ndarray:
-    """Q (3, 3) as the rig has it, else as the reading goes with the specific force."""
+    """Q (3, 3) as the rig states it, otherwise from the correlation of the reading with the specific
+    force."""
     total = weights.sum()
     f, v = force - weights @ force / total, felt - weights @ felt / total
     together = (weights[:, None] * f).T @ v
@@ -307,7 +310,7 @@ def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.nda
 
 
 def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
-    """What the tool does to its environment (num_timesteps, 3), in the world's axes [N]."""
+    """Force of the tool on its environment (num_timesteps, 3), in the world's axes [N]."""
     gripper = rig.wrist
     reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - tool.since)[:, None]
     own = np.tensordot(tool.shares, _terms(pose, gripper, rig.gravity), 1)
@@ -315,16 +318,16 @@ def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
     return force if gripper.frame == "world" else np.einsum("tij,tj->ti", pose.turned, force)
 
 
-BETTER = 0.8  # chosen: of the noise; over a hundred samples that are none another's so much is beyond chance
+BETTER = 0.8  # chosen: ratio of noises; over a hundred independent samples so much is beyond chance
 
 
 def order_warnings(trial: Trial, rig: Rig, tool: Tool, free: np.ndarray) -> tuple[str, ...]:
-    """A line where free motion, samples `free` (num_timesteps,), goes with the order w, x, y, z.
+    """A line if free motion, samples `free` (num_timesteps,), is better explained by the order w, x, y, z.
 
-    Only of a hand that turns enough to weigh its tool apart from the sensor's offset: else any order will do.
+    Only for a hand that turns enough to weigh its tool apart from the sensor's offset; else any order fits.
     """
-    gripper = rig.gripper
-    if gripper is None or gripper.quaternion is None or not tool.weighed:
+    gripper = rig.wrist
+    if gripper.quaternion is None or not tool.weighed:
         return ()
     rolled = (*gripper.quaternion[1:], gripper.quaternion[0])
     other = gripper.model_copy(update={"quaternion": rolled})

@@ -1,16 +1,17 @@
-"""A gripper with a sensor in its wrist as the two fingers that the contact equations know.
+"""A gripper with a wrist sensor, converted to the two fingers of the contact equations.
 
-The wrist feels the sum of what both fingers do; each finger's channels hold half of it. What
-they press against each other with does not reach the wrist. Where no grip force is recorded, the
-pads' own spring gives it: their squeeze is the opening at which they touched (`hmmseg.hand.grips`) less the
-one they are held at. That says when something is held, but is no measured force: it does not bound friction.
+The wrist feels the sum of the forces of both fingers; each finger's channels get half of it. The wrist does
+not feel the grip itself. If no grip force is recorded, the pads' elasticity gives it: their compression is
+the opening at which they touched (`hmmseg.hand.grips`) less the opening at which they are held. It shows
+when something is held, but is no measured force: it does not bound friction.
 
-A hand that is raised with what it holds bears it. Where no hold lifts anything, the columns are read the
-other ways that a rig may have it, and the way in which the hand lifts something every time is what to write.
+A hand that is raised with an object bears its weight. If no hold lifts anything, the columns are interpreted
+in the other ways that a rig may have it, and the one in which every hold lifts something is suggested.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from collections.abc import Mapping
@@ -30,12 +31,12 @@ from hmmseg.levels import MOVED, SURE
 from hmmseg.robust import bridged, robust_sd, runs
 
 WIDEST = 1.0  # limit: m; no parallel gripper opens further
-NARROW = 2e-4  # limit: m
-CANCELLED = 0.05  # limit: share of either finger's way
+NARROW = 2e-4  # limit: m; an opening that changes less does not move
+CANCELLED = 0.05  # limit: of the travel of either finger, in their sum
 
 
 def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
-    """Openings in other units; one that does not change, or is one finger's."""
+    """Openings in other units, without motion, or of one finger only."""
     gripper = rig.wrist
     for name in gripper.opening:
         values = trial.channels[name]
@@ -43,7 +44,7 @@ def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
         if swing > WIDEST:
             unit, text = ("cm", 'cm (or "in")') if swing < 15 else ("mm", "mm (or %)")
             problem = f"swings by {swing:.4g} m, a gripper by less than {WIDEST:g} m: it looks like {text}"
-            return [Finding(name, problem, changed(name, rig, unit=unit))]
+            return [Finding(name, problem, changed([name], rig, unit=unit))]
         if swing < NARROW:
             problem = f"changes by {swing:.2g} m in all (of {widest:.3g} m)"
             raise InputError(f"{trial.file}: column {name}", problem, "a gripper that closes and opens, in m")
@@ -51,7 +52,7 @@ def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
 
 
 def _cancelling(trial: Trial, rig: Rig) -> list[Finding]:
-    """Two fingers' ways of which one counts the other way: their sum stays while they move."""
+    """Travels of two fingers, one counted the other way: their sum stays while they move."""
     names = rig.wrist.opening
     if len(names) < 2:
         return []
@@ -61,53 +62,43 @@ def _cancelling(trial: Trial, rig: Rig) -> list[Finding]:
         return []
     name = names[int(np.nanmedian(second) < np.nanmedian(first))]
     problem = f"moves while {' + '.join(names)} stays as it is: it counts the other way"
-    return [Finding(name, problem, changed(name, rig, sign=-1))]
+    return [Finding(name, problem, changed([name], rig, sign=-1))]
 
 
 def _one_finger(rig: Rig) -> list[Finding]:
     """An opening of one column that is named after one of two fingers."""
     gripper = rig.wrist
     (name, *more) = gripper.opening
+    name, *more = gripper.opening
     entry = (rig.columns | rig.topics).get(name)
-    if more or (entry is not None and entry.unit is not None):
-        return []
-    if re.search(r"finger.*(\d|left|right)|(left|right).*finger", name.lower()) is None:
+    of_one = re.search(r"finger.*(\d|left|right)|(left|right).*finger", name.lower()) is not None
+    if more or not of_one or (entry is not None and entry.unit is not None):
         return []
     problem = "is named after one finger, and would show half of the opening: widths halved"
-    return [Finding(name, problem, changed(name, rig, unit=2.0), certain=False)]
+    return [Finding(name, problem, changed([name], rig, unit=2.0), certain=False)]
 
 
 def _travel(trial: Trial, name: str) -> float:
     return float(np.nanmax(trial.channels[name]) - np.nanmin(trial.channels[name]))
 
 
-def counts_closing(trial: Trial, rig: Rig) -> InputError:
-    """The line for an opening that grows as the gripper closes."""
-    gripper = rig.wrist
-    most = float(sum(bridged(trial.channels[name], trial.t).max() for name in gripper.opening))
-    name = gripper.opening[0]
-    remedy = Finding(name, "", changed(name, rig, sign=-1, offset=round(most, 4))).remedy
-    problem = "is widest while the hand carries something: it counts how far the gripper has closed"
-    return InputError(f"{trial.file}: column {name}", problem, remedy)
-
-
 def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
-    """The line for a sign that is the other way round: lifts take weight `load` [N] off the hand.
+    """The error for a flipped sign: lifts take weight `load` [N] off the hand.
 
-    None: nothing is lifted that would decide, and free motion contradicts the stated sign.
+    None: nothing is lifted, and free motion contradicts the stated sign.
     """
     problem = "go against the hand's own acceleration in free motion"
     if load is not None:
         problem = f"say that what is lifted pulls up with {abs(load):.3g} N"
     where = f"{trial.file}: columns {', '.join(rig.wrist.wrench[:3])}"
-    said = str(not rig.wrist.reaction).lower() if rig.wrist.reaction is not None else "true"
+    right = "false" if rig.wrist.reaction else "true"
     return InputError(
-        where, f"{problem}: the sign is the other way round", f"reaction = {said} under [gripper]"
+        where, f"{problem}: the sign is the other way round", f"reaction = {right} under [gripper]"
     )
 
 
 def pose_remark(trial: Trial, rig: Rig, load: float) -> str:
-    """The warning where a lift shows one sign and free motion the other: readings that go with the pose."""
+    """The warning if lifts show one sign and free motion the other: readings that depend on the pose."""
     where = f"{trial.file}: columns {', '.join(rig.wrist.wrench[:3])}"
     return (
         f"{where} bear {load:.3g} N of what is lifted, but go against the hand's own acceleration in free "
@@ -115,39 +106,21 @@ def pose_remark(trial: Trial, rig: Rig, load: float) -> str:
     )
 
 
-def points_down(trial: Trial, rig: Rig) -> InputError:
-    """The line for an axis that counts downwards: what is lifted would go down."""
-    gripper = rig.wrist
-    axis = gripper.up.lstrip("-")
-    said = axis if gripper.up.startswith("-") else f"-{axis}"
-    name = {str(each): name for each, name in gripper.position.items()}[axis]
-    where = f"{trial.file}: column {name}"
-    return InputError(where, "goes down whenever the hand bears something, as if it counted downwards",
-                      f'up = "{said}" under [gripper]')  # fmt: skip
-
-
-def exchanged_axes(trial: Trial, rig: Rig) -> InputError:
-    """The line for position columns of the wrong axes: what is carried would pull sideways."""
-    gripper = rig.wrist
-    up, position = gripper.up.lstrip("-"), {str(axis): name for axis, name in gripper.position.items()}
-    others = [axis for axis in AXES if axis != up and axis in position]
-    across = gripper.closing if gripper.closing in others else others[0]
-    swapped = position | {up: position[across], across: position[up]}
-    text = ", ".join(f"{axis} = {json.dumps(swapped[axis])}" for axis in AXES if axis in swapped)
-    where = f"{trial.file}: columns {position[up]}, {position[across]}"
-    problem = f"say that the hand's load pulls along {across} and never along {up}: axes exchanged"
-    return InputError(where, problem, f"position = {{{text}}} under [gripper]")
-
-
-LEAST = 3  # numerics: samples; of fewer there is no scatter
-WENT = 8  # numerics: smoothing windows of a hand that goes somewhere before what it bears is judged
+LEAST = 3  # numerics: samples; fewer have no scatter
+WENT = 8  # numerics: smoothing windows of motion after which the load is judged
 
 
 @dataclass(frozen=True)
 class Held:
-    """Grips, the load of each (None where the hand goes nowhere) [N], the tool, and what it does to its
-    environment, `force` (num_timesteps, 3), in the world's axes [N]; `free` (num_timesteps,): samples
-    that are surely no grip's; `lifts`: loads that are not nothing of grips in which the hand is raised [N].
+    """Grips and their loads.
+
+    Attributes:
+        grips: in order.
+        loads: of each grip [N], None if the hand does not move in it.
+        tool: from free motion.
+        force: (num_timesteps, 3) of the tool on its environment, in the world's axes [N].
+        free: (num_timesteps,) samples that surely belong to no grip.
+        lifts: nonzero loads of the grips in which the hand is raised [N].
     """
 
     grips: list[Grip]
@@ -158,9 +131,9 @@ class Held:
     lifts: list[float]
 
 
-def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None
+def find_grips(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: np.ndarray | float | None
             ) -> Held:  # fmt: skip
-    """What closings of the opening (num_timesteps,) [m] hold; `pressing` as `grip_force_of` has it."""
+    """Grips of the opening (num_timesteps,) [m]; `pressing` as from `grip_force_of`."""
     held = closings(opening)
     free = free_samples(opening, held)
     tool = free_tool(trial, rig, pose, free)
@@ -174,34 +147,50 @@ def held_by(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, pressing: n
 
 
 def contradiction(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, held: Held) -> InputError | None:
-    """What to write where no grip lifts anything, None where no other reading explains it, as of slides.
+    """The error if no grip lifts anything and another interpretation of the rig explains that, else None.
 
-    An opening of the other sign makes free motion of what was held and shows by how much better the tool's
-    own share is then found; axes that are exchanged or reversed leave that as it is.
+    An opening of the other sign takes holds for free motion, which the noise about the tool's model shows;
+    axes that are exchanged or reversed leave that noise unchanged.
     """
-    try:
-        flipped = held_by(trial, rig, pose, -opening, None)
-    except InputError:
-        flipped = None
+    gripper, flipped = rig.wrist, None
+    with contextlib.suppress(InputError):
+        flipped = find_grips(trial, rig, pose, -opening, None)
     if flipped is not None and _lifts_all(flipped.loads) and flipped.tool.noise < held.tool.noise:
-        return counts_closing(trial, rig)
-    others = [(replace(pose, up=-pose.up), points_down),
-              (replace(pose, up=pose.across, across=pose.up), exchanged_axes)]  # fmt: skip
-    borne = [[_load(grip, other, held.force, held.tool) for grip in held.grips
-              if _raised(grip, other).any()] for other, _ in others]  # fmt: skip
-    least = [min(load for load in loads if load) if _lifts_all(loads) else 0.0 for loads in borne]
-    best = int(np.argmax(least))
-    return others[best][1](trial, rig) if least[best] > 0 else None
+        name = gripper.opening[0]
+        widest = float(sum(bridged(trial.channels[name], trial.t).max() for name in gripper.opening))
+        remedy = Finding(name, "", changed([name], rig, sign=-1, offset=round(widest, 4))).remedy
+        problem = "is widest while the hand carries something: it counts how far the gripper has closed"
+        return InputError(f"{trial.file}: column {name}", problem, remedy)
+    least = []
+    for other in (replace(pose, up=-pose.up), replace(pose, up=pose.across, across=pose.up)):
+        lifting = [grip for grip in held.grips if _raised(grip, other).any()]
+        loads = [_load(grip, other, held.force, held.tool) for grip in lifting]
+        least.append(min(load for load in loads if load) if _lifts_all(loads) else 0.0)
+    if not any(least):
+        return None
+    up, position = gripper.up.lstrip("-"), {str(axis): name for axis, name in gripper.position.items()}
+    if least[0] >= least[1]:
+        reversed_up = up if gripper.up.startswith("-") else f"-{up}"
+        problem = "goes down whenever the hand bears something, as if it counted downwards"
+        remedy = f'up = "{reversed_up}" under [gripper]'
+        return InputError(f"{trial.file}: column {position[up]}", problem, remedy)
+    others = [axis for axis in AXES if axis != up and axis in position]
+    across = gripper.closing if gripper.closing in others else others[0]
+    swapped = position | {up: position[across], across: position[up]}
+    text = ", ".join(f"{axis} = {json.dumps(swapped[axis])}" for axis in AXES if axis in swapped)
+    problem = f"say that the hand's load pulls along {across} and never along {up}: axes exchanged"
+    where = f"{trial.file}: columns {position[up]}, {position[across]}"
+    return InputError(where, problem, f"position = {{{text}}} under [gripper]")
 
 
 def _lifts_all(loads: list[float | None]) -> bool:
-    """Whether every grip that goes anywhere bears something, and there is one."""
+    """Whether there are grips with motion, and all of them bear something."""
     there = [load for load in loads if load is not None]
     return bool(there) and min(there) > 0
 
 
 def grip_force_of(channels: Mapping[str, Any], gripper: Gripper) -> np.ndarray | float | None:
-    """What each pad presses with [N]: samples, or a number while it grips; None where it is unknown."""
+    """Force of each pad [N], by sample or as a constant while it grips; None if unknown."""
     if isinstance(gripper.grip_force, str):
         return np.abs(channels[gripper.grip_force])
     if gripper.grip_force is not None:
@@ -212,36 +201,32 @@ def grip_force_of(channels: Mapping[str, Any], gripper: Gripper) -> np.ndarray |
 
 
 def _raised(grip: Grip, pose: Pose) -> np.ndarray:
-    """Samples of a grip (num_samples,) in which the hand is higher than where it begins and ends.
-
-    None where they are too few.
-    """
+    """Samples (num_samples,) of a grip in which the hand is higher than at both its ends; none if too few."""
     height = pose.position[grip.start : grip.stop] @ pose.up
     raised = height - max(height[0], height[-1]) > MOVED
     return raised & (raised.sum() > LEAST)
 
 
 def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
-    """What the hand carries while raised, or pushes while it moves along [N]: 0 where it is nothing.
+    """Load carried while raised, or pushed along while moving [N]; 0 if insignificant.
 
-    None where it never goes anywhere, which leaves nothing to judge by.
+    None if the hand does not move, which leaves nothing to judge by.
     """
-    raised, gone = _raised(grip, pose), went(grip.start, grip.stop, pose)
-    lifted, inside = bool(raised.any()), slice(grip.start, grip.stop)
-    moved, way = (raised, pose.up) if lifted else (gone, pose.across)
-    load = borne(force[inside][moved] @ way, pose, tool)
+    raised, moved = _raised(grip, pose), has_moved(grip.start, grip.stop, pose)
+    lifted, force = bool(raised.any()), force[grip.start : grip.stop]
+    load = median_load(force[raised] @ pose.up if lifted else force[moved] @ pose.across, pose, tool)
     return load if lifted or load is None else abs(load)
 
 
-def went(start: int, stop: int, pose: Pose) -> np.ndarray:
-    """Which samples from `start` to `stop` the hand has gone away from where it is at first."""
+def has_moved(start: int, stop: int, pose: Pose) -> np.ndarray:
+    """Samples from `start` to `stop` in which the hand has left its place at the start."""
     return np.linalg.norm(pose.position[start:stop] - pose.position[start], axis=1) > MOVED
 
 
-def borne(load: np.ndarray, pose: Pose, tool: Tool) -> float | None:
-    """What samples of a load (num_samples,) [N] agree on, 0 where it is within its noise; None of too few.
+def median_load(load: np.ndarray, pose: Pose, tool: Tool) -> float | None:
+    """Median of a load (num_samples,) [N], 0 if within its noise; None of too few samples.
 
-    Samples within one smoothing window go together.
+    Samples within one smoothing window are not independent.
     """
     load = load[np.isfinite(load)]
     if load.size <= LEAST:
@@ -253,23 +238,25 @@ def borne(load: np.ndarray, pose: Pose, tool: Tool) -> float | None:
 
 
 def bears(start: int, stop: int, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
-    """As a grip's load [N] where it lasts still; None until the hand has gone somewhere for long enough."""
-    gone, height = went(start, stop, pose), pose.position[start:stop] @ pose.up
+    """Load [N] of a grip that still lasts; None until the hand has moved for long enough."""
+    gone, height = has_moved(start, stop, pose), pose.position[start:stop] @ pose.up
     gone &= np.isfinite(force[start:stop]).all(axis=1)
     if gone.sum() * float(np.median(np.diff(pose.t))) < WENT * pose.window:
         return None
     raised = height[gone] - height[0] > MOVED
-    up, aside = (borne(force[start:stop][gone] @ way, pose, tool) or 0.0 for way in (pose.up, pose.across))
+    moving = force[start:stop][gone]
+    up, aside = (median_load(moving @ way, pose, tool) or 0.0 for way in (pose.up, pose.across))
     return up if raised.mean() > 0.5 else max(abs(up), abs(aside))
 
 
-# prior: s; sd by which pads touch and let go off the opening's width by this: they are no ideal springs
+# prior: s; sd of touch and release about the times at which the opening passes the width: pads are no ideal
+# springs
 LAG = 0.012
-TILT = 0.01  # prior: rad; an arm whose orientation is not recorded holds its hand level by about as much
-SURELY = 0.1  # chosen: s from any grip in which nothing is held for sure: a touch is known to a fifth of it
-CLIPPED = 2.0  # chosen: noise scales
+TILT = 0.01  # prior: rad; tilt of a hand whose orientation is not recorded
+SURELY = 0.1  # chosen: s from any grip beyond which nothing is held; a touch is known to a fifth of it
+CLIPPED = 2.0  # chosen: noise scales to which forces in free motion are clipped
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
-NOMINAL = 1.0  # numerics: N; assumed for a grip of rigid pads whose force was not measured: any will do
+NOMINAL = 1.0  # numerics: N; force assumed for a grip of rigid pads if none was measured; any will do
 HIDDEN_GRIP = (
     "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
     "[gripper] would tell"
@@ -280,8 +267,8 @@ HALVES = (
 )
 
 
-def halved(trial: Trial) -> bool:
-    """Whether the fingers' forces are halves of one wrist sensor's: no two fingertips feel the same."""
+def is_halved(trial: Trial) -> bool:
+    """Whether the fingers' forces are halves of one wrist sensor's: two fingertips never feel the same."""
     pairs = [("fx1", "fx2"), ("fy1", "fy2")]
     if not all(name in trial.channels for pair in pairs for name in pair):
         return False
@@ -289,8 +276,8 @@ def halved(trial: Trial) -> bool:
     return all(same) and any(np.ptp(trial.channels[a][np.isfinite(trial.channels[a])]) > 0 for a, _ in pairs)
 
 
-def from_halves(trial: Trial, rig: Rig) -> Trial:
-    """A trial whose fingers' forces are halves of a wrist's, as such a gripper's."""
+def join_halves(trial: Trial, rig: Rig) -> Trial:
+    """The two fingers of a trial whose forces are halves of a wrist's, read as that of a gripper."""
     c = trial.channels
     channels = {
         "x": (c["x1"] + c["x2"]) / 2, "z": (c["y1"] + c["y2"]) / 2, "opening": c["x2"] - c["x1"],
@@ -302,22 +289,22 @@ def from_halves(trial: Trial, rig: Rig) -> Trial:
 
 
 def two_fingers(trial: Trial, rig: Rig) -> Trial:
-    """The trial with the channels of a Cartesian two-finger hand; InputError for what cannot be.
+    """The trial as that of a Cartesian two-finger hand; InputError for contradictions.
 
-    `touch_sd` of the result [m]: how well the openings at which the pads touch are known.
+    `touch_sd` of the result [m]: uncertainty of the openings at which the pads touch.
     """
     gripper = rig.wrist
     pose = pose_of(trial, gripper)
     opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
     pressing = grip_force_of(trial.channels, gripper)
-    held = held_by(trial, rig, pose, opening, pressing)
+    held = find_grips(trial, rig, pose, opening, pressing)
     signs: tuple[str, ...] = ()
     if held.lifts and max(held.lifts) < 0:
-        # What is lifted hangs on the hand: that shows the sign before the hand's own inertia does.
+        # Lifted objects weigh on the hand, which shows the sign more surely than the hand's own inertia.
         least = min(held.lifts)
         for reaction in (True, False) if gripper.reaction is None else ():
             other = rig.model_copy(update={"gripper": gripper.model_copy(update={"reaction": reaction})})
-            found = held_by(trial, other, pose, opening, pressing)
+            found = find_grips(trial, other, pose, opening, pressing)
             if found.lifts and max(found.lifts) > 0:
                 held, rig, signs = found, other, (pose_remark(trial, other, max(found.lifts)),)
                 break
@@ -328,9 +315,9 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     elif held.tool.against:
         raise other_sign(trial, rig)
     if held.grips and not held.lifts:
-        text = contradiction(trial, rig, pose, opening, held)
-        if text is not None:
-            raise text
+        error = contradiction(trial, rig, pose, opening, held)
+        if error is not None:
+            raise error
     loaded = [grip for grip, load in zip(held.grips, held.loads, strict=True) if load is None or load != 0]
     found = as_fingers(trial, rig, pose, held.tool, opening, held.force, loaded or held.grips, pressing)
     order = order_warnings(trial, rig, held.tool, held.free)
@@ -340,7 +327,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
 
 def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarray, force: np.ndarray,
                grips: list[Grip], pressing: np.ndarray | float | None) -> Trial:  # fmt: skip
-    """The trial as two fingers', from what the tool does (`force`, (num_timesteps, 3), world) and holds."""
+    """The trial as that of two fingers, from the tool's `force` (num_timesteps, 3) [N, world] and grips."""
     t = trial.t
     x, y = pose.position @ pose.across, pose.position @ pose.up
     velocity = smooth(t, pose.position, deriv=1)
@@ -365,7 +352,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
             grip[inside] = size * (np.clip(squeeze / whole, 0.05, 1.0) if whole > 1e-6 else 1.0)
         else:
             grip[inside] = squeeze * rig.fingertip.normal_stiffness / 2
-        if rigid:  # what gives is not the pads, and what is held has one width
+        if rigid:  # the drive yields instead of the pads, and the object has one width
             shown[inside] = np.maximum(shown[inside], each.width)
     closing = smooth(t, shown, deriv=1) / 2
     channels = {
@@ -374,7 +361,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
         "x2": x + shown / 2, "y2": y, "vx2": velocity @ pose.across + closing, "vy2": velocity @ pose.up,
         "fx2": fx / 2 - grip, "fy2": fy / 2,
     }  # fmt: skip
-    if rig.wrist.turns:  # by which fingers and block stand askew, who are level in these channels
+    if rig.wrist.turns:  # the roll of fingers and block, who are level in these channels
         closing = pose.turned[:, :, AXES.index(rig.wrist.closing)]
         channels[ROLL] = np.arcsin(np.clip(closing @ pose.up, -1.0, 1.0))
     if isinstance(pressing, np.ndarray):
@@ -389,7 +376,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     from scipy.ndimage import maximum_filter1d  # slow to import
 
     wrong, step = _inertia(t, pose, tool, rig.wrist.turns, rig.gravity), float(np.median(np.diff(t)))
-    # A load that changes by so much per second is off by that much of its time.
+    # The error of the force, in units of time: divided by how fast the load changes.
     pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(fy), t)), _around(t, pose))
     late = np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)) / np.maximum(pace, tool.noise / step)
     timing = np.minimum(late, pose.window / 2)
@@ -399,12 +386,11 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
 
 
 def _inertia(t: np.ndarray, pose: Pose, tool: Tool, turns: bool, gravity: float) -> np.ndarray:
-    """By how much the tool's inertia may be wrong, across and up (num_timesteps, 2) [N].
+    """Standard error of the tool's inertial force, across and up (num_timesteps, 2) [N].
 
-    The acceleration is smoothed. Where it jumps (a block that is set down stops the hand) the tool's share
-    is wrong for as long as the window, by about what a window twice as wide makes of it in turn (root mean
-    square). What free motion leaves unexplained is the tool's own too, and a tilt that is not recorded turns
-    its weight sideways.
+    Where the acceleration jumps (a block that is set down stops the hand), smoothing makes it wrong for the
+    length of the window, by about the change that a window twice as wide makes (root mean square). The noise
+    of free motion adds to it, and so does an unrecorded tilt, which turns the tool's weight sideways.
     """
     from scipy.ndimage import uniform_filter1d  # slow to import
 
@@ -419,12 +405,12 @@ def _inertia(t: np.ndarray, pose: Pose, tool: Tool, turns: bool, gravity: float)
 
 
 def _around(t: np.ndarray, pose: Pose) -> int:
-    """Samples of the smoothing window, an odd number."""
+    """Samples in the smoothing window, an odd number."""
     return max(3, round(pose.window / float(np.median(np.diff(t)))) // 2 * 2 + 1)
 
 
 def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> list[str]:
-    """Where the wrist feels something for a while though the opening says that nothing is held."""
+    """Reports of forces in free motion, by the opening, that last."""
     t, out = trial.t, []
     for start, stop in runs(free & (np.nan_to_num(felt) > max(2 * SURE * tool.noise, STRAY))):
         if t[stop - 1] - t[start] > STRAY_TIME:
@@ -435,7 +421,7 @@ def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> lis
 
 
 def _touches(t: np.ndarray, opening: np.ndarray, grip: Grip) -> list[tuple[float, float]]:
-    """When the opening passes the width, closing and opening again, and how uncertain that is [s]."""
+    """Times at which the opening passes the width, closing and opening again, and their sds [s]."""
     found = []
     for i in (grip.start, grip.stop):
         if not 0 < i < t.size:
@@ -446,20 +432,20 @@ def _touches(t: np.ndarray, opening: np.ndarray, grip: Grip) -> list[tuple[float
         period = float(t[i] - t[i - 1])
         share = before / (before - after) if before != after else 0.5
         speed = max(abs(after - before) / period, 1e-3)
-        # Linear between samples, of which the contact bends the way: uniform over half of them.
+        # Interpolated linearly, though the contact bends the course: uniform over half a sample.
         sd = float(np.sqrt((grip.width_sd / speed) ** 2 + period**2 / 48 + LAG**2))
         found.append((float(t[i - 1] + share * period), sd))
     return found
 
 
 def _notes(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
-    """What was found of the tool, for the reader."""
+    """What was found about the tool, for the reader."""
     gripper = rig.wrist
     if gripper.tool_mass is not None and gripper.sensor_axes is not None and gripper.reaction is not None:
         return ()
     mass = "as given" if gripper.tool_mass else "from free motion"
     text = f"{trial.file}: tool of {tool.mass:.3g} kg on the sensor ({mass})"
-    if tool.mass <= 0:  # readings that go with the pose hide it
+    if tool.mass <= 0:  # readings that depend on the pose hide it
         text = f"{trial.file}: free motion does not tell what the tool on the sensor weighs"
     if gripper.sensor_axes is None and gripper.frame == "sensor":
         up = tool.axes @ direction(gripper.up)

@@ -27,7 +27,7 @@ Direction = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 def _by_axis(value: Any) -> Any:
-    """A list of three columns stands for x, y, z."""
+    """Turn a list of three columns into a table by axis x, y, z."""
     if isinstance(value, list | tuple):
         if len(value) != 3:
             raise ValueError(f"has {len(value)} columns; expected x, y, z, or a table such as "
@@ -41,30 +41,34 @@ def _several(value: Any) -> Any:
 
 
 def _counted(names: tuple[str, ...], counts: tuple[int, ...], expected: str) -> tuple[str, ...]:
-    """Names of columns, as many as one of `counts`; ValueError otherwise."""
+    """Names of columns, of which there must be as many as one of `counts`; ValueError otherwise."""
     if len(names) not in counts:
         raise ValueError(f"has {len(names)} columns; expected {expected}")
     return names
 
 
 class Gripper(StrictTable):
-    """Columns of the tool's pose, its opening and the wrench, and the tool that hangs on the sensor.
+    """A parallel gripper: columns of the tool's pose, opening and wrench, and the tool on the sensor.
 
-    `position`: columns of the tool's position [m] by axis of the world; an axis that is absent does not
-    move. `quaternion` (x, y, z, w) or `rotation_vector` (axis times angle [rad]): columns of the tool's
-    orientation; without them it does not turn, and its axes are the world's. `up`: the world's axis
-    against gravity. `opening`: the distance between the pads [m], or one column a finger to be summed.
-
-    `wrench`: columns fx, fy, fz [N] and where there are any tx, ty, tz [N m], given along the axes of
-    the `sensor`, the `tool` or the `world` (`frame`). `sensor_axes`: along which axes of the tool the
-    sensor's x, y, z point. `reaction`: the wrench is what the environment does to the tool, not what
-    the tool does. What is not said of the two is found from how the tool's mass moves and hangs.
-    `tool_mass` [kg] is found from free motion where it is not given, an offset of the sensor always.
-    `centre_of_mass` [m] (tool's axes, from the sensor) may be stated; forces do not depend on it.
-
-    `closing`: the tool's axis along which the pads close. `fingertip`: where the pads' middle lies [m]
-    (tool's axes, from the tool's position). `grip_force`: what each pad presses with, a column or a
-    number [N]. `motor_current`: a column [A], with `force_per_ampere` [N/A] a grip force.
+    Attributes:
+        position: columns of the tool's position [m] by axis of the world; an absent axis does not move.
+        quaternion: columns x, y, z, w of the tool's orientation.
+        rotation_vector: columns of axis times angle [rad] instead. Without either the tool does not turn, and
+            its axes are the world's.
+        up: axis of the world against gravity.
+        opening: column of the distance between the pads [m], or one per finger to be summed.
+        wrench: columns fx, fy, fz [N] and optionally tx, ty, tz [N m].
+        frame: the axes of the wrench, those of the `sensor`, the `tool` or the `world`.
+        sensor_axes: axes of the tool along which the sensor's x, y, z point; by default found from free
+            motion.
+        reaction: whether the wrench is exerted by the environment on the tool; by default found as well.
+        closing: axis of the tool along which the pads close.
+        tool_mass: [kg]; by default found from free motion, as an offset of the sensor always is.
+        centre_of_mass: [m] in the tool's axes, from the sensor; may be stated, but forces do not depend on
+            it.
+        fingertip: midpoint of the pads [m] in the tool's axes, from the tool's position.
+        grip_force: force of each pad, a column or a number [N].
+        motor_current: column [A], which with `force_per_ampere` [N/A] gives the grip force.
     """
 
     position: Annotated[dict[Axis, Name], BeforeValidator(_by_axis)] = Field(
@@ -117,7 +121,7 @@ class Gripper(StrictTable):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Every channel a trial of this gripper needs."""
+        """All channels that a trial of this gripper needs."""
         force = self.grip_force if isinstance(self.grip_force, str) else None
         named = (
             *self.position.values(), *(self.quaternion or ()), *(self.rotation_vector or ()), *self.opening,
@@ -132,7 +136,7 @@ class Gripper(StrictTable):
 
 
 def direction(axis: str) -> Any:
-    """Unit vector (3,), an array, of an axis such as `-z`."""
+    """Unit vector (3,), an array, along an axis such as `-z`."""
     import numpy as np  # as above
 
     return (-1.0 if axis[0] == "-" else 1.0) * np.eye(3)[AXES.index(axis[-1])]
@@ -156,10 +160,10 @@ class Fingertip(StrictTable):
 
 
 class Noise(StrictTable):
-    """Standard deviation of one sample; None is learned from the recording.
+    """Noise standard deviations of one sample; None is learned from the recording.
 
-    A jointed hand gives `angle` [rad] and `velocity` [rad/s]; a Cartesian hand gives
-    `position` [m] and `velocity` [m/s]; both give `force` [N].
+    `angle` [rad] and `velocity` [rad/s] of a jointed hand, `position` [m] and `velocity` [m/s] of a Cartesian
+    one, and `force` [N] of both.
     """
 
     angle: FinitePositive | None = None
@@ -194,11 +198,11 @@ _Four = tuple[Deviation, Deviation, Deviation, Deviation]
 
 
 class Systematic(StrictTable):
-    """Standard deviations of what all trials share; 0 where absent.
+    """Standard deviations of errors common to all trials; 0 where absent. One number stands for all entries.
 
-    `force_bias` [N] and `force_gain` (relative) per finger and axis (fx1, fy1, fx2, fy2),
-    `joint_offset` [rad] per joint (q11, q12, q21, q22), `link_length` per link (finger 1's two,
-    then finger 2's) and `pad_stiffness` per finger, both relative. One number stands for all.
+    `force_bias` [N] and `force_gain` (relative) per finger and axis (fx1, fy1, fx2, fy2), `joint_offset`
+    [rad] per joint (q11, q12, q21, q22), `link_length` per link (finger 1's two, then finger 2's) and
+    `pad_stiffness` per finger, both relative.
     """
 
     force_bias: Annotated[_Four, _per_entry(FORCE_CHANNELS)] = (0.0, 0.0, 0.0, 0.0)
@@ -209,7 +213,7 @@ class Systematic(StrictTable):
 
 
 class Tolerance(StrictTable):
-    """The smallest gap that matters: `position` [m], `force` [N], `property` (share); None where not said."""
+    """The smallest gap that matters: `position` [m], `force` [N], `property` (share); None if unstated."""
 
     position: FinitePositive | None = None
     force: FinitePositive | None = None
@@ -224,7 +228,7 @@ class Rig(StrictTable):
         """Read the description of a hand.
 
         Args:
-            source: a `rig.toml`, its table as a dict, or a rig, which is given back as it is.
+            source: a `rig.toml`, its table as a dict, or a rig, which is returned as it is.
 
         Returns:
             The rig, lengths in m, forces in N, angles in rad, stiffnesses in N/m.
@@ -246,7 +250,7 @@ class Rig(StrictTable):
     gripper: Gripper | None = None
     columns: Columns = Field(default={})
     topics: Columns = Field(default={})
-    effects: dict[Name, dict[Name, Finite]] = Field(default={})  # of the virtual model alone: simulate's
+    effects: dict[Name, dict[Name, Finite]] = Field(default={})  # of the virtual model, for `simulate` alone
 
     @model_validator(mode="after")
     def _two_fingers(self) -> Rig:
@@ -263,7 +267,7 @@ class Rig(StrictTable):
 
     @property
     def wrist(self) -> Gripper:
-        """The gripper with a sensor in its wrist; ValueError for any other hand."""
+        """The gripper with a wrist sensor; ValueError for any other hand."""
         if self.gripper is None:
             raise ValueError("a hand of fingertips has no wrist sensor")
         return self.gripper

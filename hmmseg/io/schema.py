@@ -1,4 +1,4 @@
-"""What every TOML table has in common: strict fields, and one line for what is at fault."""
+"""Strict TOML and JSON tables: reading, and validation that reports a fault in one line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from hmmseg.errors import InputError, nearest
 
-LARGEST = 1e12  # numerics: SI units; squares of what is larger overflow sooner or later
+LARGEST = 1e12  # numerics: SI units; squares of larger numbers overflow sooner or later
 
 
 def _rigid(value: float) -> float:
@@ -61,12 +61,12 @@ def validated(model: type[Model], table: dict[str, Any], where: str) -> Model:
 
 
 def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
-    """Keys of the table that contains the unknown last part of `location`."""
+    """Keys of the table that contains the last, unknown part of `location`."""
     for part in location[:-1]:
         named = {field.alias or name: field for name, field in model.model_fields.items()}
         field = named.get(str(part))
         inner = None if field is None else _inner_model(field.annotation)
-        model = inner if inner is not None else model  # a table of tables: its names are not fields
+        model = inner if inner is not None else model  # keys of a table of tables are no fields
     return [field.alias or name for name, field in model.model_fields.items()]
 
 
@@ -97,7 +97,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def read_json(path: str | Path, expected: str) -> dict[str, Any]:
-    """Table of a JSON file; InputError, which says what was `expected`, for an absent or malformed file."""
+    """Table of a JSON file; InputError naming what was `expected` for an absent or malformed file."""
     try:
         table = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -112,7 +112,7 @@ def read_json(path: str | Path, expected: str) -> dict[str, Any]:
 def parse_toml(text: str, where: str) -> dict[str, Any]:
     """Table of a TOML text; InputError for a malformed or hostile one."""
     if any(len(JOINT.findall(token)) > DEEPEST for token in SEPARATOR.split(text)):
-        raise InputError(where, "not valid TOML: nested too deeply")  # it would take tomllib gigabytes
+        raise InputError(where, "not valid TOML: nested too deeply")  # tomllib would need gigabytes
     try:
         return tomllib.loads(text)
     except RecursionError:

@@ -1,4 +1,4 @@
-"""A table as a file or a frame has it, and numbers from its columns, before anything is mapped."""
+"""Tables as files and data frames hold them, and numeric columns from them, before anything is mapped."""
 
 from __future__ import annotations
 
@@ -13,18 +13,25 @@ import numpy as np
 from hmmseg.errors import InputError
 
 MAX_ROWS = 200_000_000  # numerics: more is a damaged or hostile file: 13 columns of it would be 20 GB
-MAX_COLUMNS = 20_000  # limit: no robot says so many; the arrays of each take kilobytes
+MAX_COLUMNS = 20_000  # limit: no robot records so many; the arrays of each take kilobytes
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one file or frame under their own names; only those wanted are read.
+    """Columns of one file or frame under their own names.
 
-    `names` are all that the file has; `rows` (num_rows,) numbers the rows as an editor does;
-    `units` are those that the file itself states. `origin` is where t = 0 lies in ns since 1970
-    (logs), `interpolated` marks by column what lies between two messages, and `rates` [Hz] are
-    those of the messages. `notes` say what of the file was left out. Columns may differ in length, as a
-    demonstration has more states than actions; `rows` are those of most.
+    Attributes:
+        file: name for messages.
+        names: all columns of the file.
+        columns: those that were read. Their lengths may differ, as a demonstration has more states than
+            actions.
+        rows: (num_rows,) numbers of the rows, as an editor counts them; as many as most columns have.
+        units: those stated by the file itself.
+        origin: where t = 0 lies in ns since 1970 (logs).
+        interpolated: by column, samples between two messages.
+        messages: whether it is a log of messages.
+        rates: [Hz] of the messages.
+        notes: what was left out of the file.
     """
 
     file: str
@@ -39,10 +46,10 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-def plain_table(
+def make_table(
     file: str, columns: dict[str, np.ndarray], rest: Sequence[str] = (), wanted: Sequence[str] | None = None
 ) -> Table:
-    """A table whose rows count from 1, as many as most of its columns have; `rest`: columns not read."""
+    """A table whose rows count from 1, as many as most columns have; `rest`: columns that were not read."""
     columns = flat(columns)
     if wanted is not None:
         columns = {name: values for name, values in columns.items() if name in wanted}
@@ -52,12 +59,12 @@ def plain_table(
 
 
 def is_wanted(name: str, wanted: Sequence[str] | None) -> bool:
-    """Whether a column is to be read: `pose[2]` is of the column `pose`."""
+    """Whether a column is to be read: `pose[2]` belongs to the column `pose`."""
     return wanted is None or name in wanted or any(each.startswith(f"{name}[") for each in wanted)
 
 
 def check_part(path: Path, part: str | None, found: Sequence[str]) -> None:
-    """InputError unless one of the recordings that a file holds is chosen, or there is one only."""
+    """InputError unless `part` names one of the recordings found, or there is only one."""
     if part is None and len(found) > 1:
         raise InputError(
             str(path), f"holds {len(found)} recordings", f"{path.name}#{found[0]} for one of them"
@@ -67,20 +74,20 @@ def check_part(path: Path, part: str | None, found: Sequence[str]) -> None:
 
 
 def check_unique(names: Sequence[str], where: str) -> None:
-    """InputError where two columns have one name."""
+    """InputError if two columns share a name."""
     for name, count in Counter(names).items():
         if count > 1:
             raise InputError(f"{where}: column {name}", "appears twice", "one of each name")
 
 
-def appended(table: Table, more: Table) -> Table:
-    """A table with the rows of another, of the same columns, after its own."""
+def append(table: Table, more: Table) -> Table:
+    """A table followed by the rows of another with the same columns."""
     columns = {name: np.concatenate([values, more.columns[name]]) for name, values in table.columns.items()}
     return replace(table, columns=columns, rows=np.concatenate([table.rows, more.rows]))
 
 
 def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Columns of several numbers a row as one column each: `pose[0]`, `pose[1]`, ..."""
+    """Columns of several numbers per row split into one column each: `pose[0]`, `pose[1]`, ..."""
     out: dict[str, np.ndarray] = {}
     for name, values in columns.items():
         values = np.atleast_1d(values)
@@ -93,7 +100,8 @@ def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def numbers(table: Table, name: str) -> np.ndarray:
-    """A column as float64 (num_rows,), NaN where its cell is empty; InputError names the row."""
+    """A column as float64 (num_rows,), NaN where its cell is empty; InputError for a row that is no
+    number."""
     column = table.columns[name]
     where = f"{table.file}: column {name}"
     if column.dtype.kind in "fiu":
@@ -117,7 +125,7 @@ def numbers(table: Table, name: str) -> np.ndarray:
 
 
 def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
-    """A column of times (num_rows,), and where its zero lies in ns since 1970 if it holds dates.
+    """A column of times (num_rows,) [s], and where its zero lies in ns since 1970 if it holds dates.
 
     ISO 8601 stamps and dates become s since the first; numbers stay as they are.
     """
@@ -151,17 +159,17 @@ def _is_date(entry: object) -> bool:
 
 
 def shown(value: object) -> str:
-    """A cell for a message: one line, not long."""
+    """A cell for a message: one short line."""
     text = " ".join(str(value).split())
     return text if len(text) <= 60 else text[:60] + "..."
 
 
 def frame_table(source: Any, wanted: Sequence[str] | None) -> Table:
-    """Table of a frame or dict; rows count from 1. InputError for anything else."""
+    """Table of a data frame or dict, rows counted from 1; InputError for anything else."""
     where = "DataFrame" if hasattr(source, "columns") else type(source).__name__
-    if hasattr(source, "items"):  # a dict or a frame of pandas
+    if hasattr(source, "items"):  # a dict or a pandas frame
         named = list(source.items())
-    elif hasattr(source, "get_columns"):  # one of polars
+    elif hasattr(source, "get_columns"):  # a polars frame
         named = list(zip(source.columns, source.get_columns(), strict=True))
     else:
         raise InputError(where, "is no table", "a file, a DataFrame or a dict of arrays")
@@ -169,7 +177,7 @@ def frame_table(source: Any, wanted: Sequence[str] | None) -> Table:
     check_unique(names, where)
     kept = {name: _array(values) for name, (_, values) in zip(names, named, strict=True)
             if is_wanted(name, wanted)}  # fmt: skip
-    return plain_table(where, kept, [name for name in names if name not in kept])
+    return make_table(where, kept, [name for name in names if name not in kept])
 
 
 def _array(values: Any) -> np.ndarray:

@@ -1,8 +1,7 @@
 """Task descriptions: blocks and moves, or a plain ordered list of states.
 
-`task.toml` holds either objects (each naming what it stands on) and moves, or `sequence`, a
-list of named states over arbitrary channels. Reading refuses descriptions that contradict
-themselves, naming the move at fault.
+`task.toml` holds either objects (each naming what it stands on) and moves, or `sequence`, a list of named
+states over arbitrary channels. Contradictory descriptions are refused, naming the move at fault.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from hmmseg.io.schema import read_toml
 
 GROUND = "ground"
 RESERVED = (GROUND, "finger1", "finger2")
-MAX_MOVES = 2000  # limit: with repeats; what is computed grows with their square
-MAX_REPEAT = 1000  # limit: rounds; more is a slip of the pen
+MAX_MOVES = 2000  # limit: with repeats; the cost of computations grows with their square
+MAX_REPEAT = 1000  # limit: rounds; more is a typing error
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Task:
         """Read a task description.
 
         Args:
-            source: a `task.toml`, its table as a dict, or a task, which is given back as it is.
+            source: a `task.toml`, its table as a dict, or a task, which is returned as it is.
 
         Returns:
             Blocks and moves, or a plain ordered list of states.
@@ -56,7 +55,7 @@ class Task:
 class BlockTask(Task):
     """Blocks, what each stands on at the start, and the moves in order.
 
-    `repeat` performs the list of moves that many times; "unknown": as often as recorded.
+    `repeat`: how many times the list of moves is performed; "unknown": as often as the recording shows.
     """
 
     initial: dict[str, str]
@@ -70,7 +69,7 @@ class BlockTask(Task):
 
     @property
     def performed(self) -> tuple[Move, ...]:
-        """All moves of the task, repeats written out (once where their number is unknown)."""
+        """All moves of the task, with repeats written out (once if their number is unknown)."""
         return self.moves * (1 if self.repeat == "unknown" else self.repeat)
 
 
@@ -213,10 +212,10 @@ def _parse_move(number: int, entry: Any, where: str) -> Move:
 
 
 def _check_moves(task: BlockTask, where: str) -> None:
-    """Perform the moves on paper; InputError with the number of the first that cannot be.
+    """Simulate the moves; InputError with the number of the first impossible one.
 
-    An unknown number of rounds is performed until the objects stand as they have stood before:
-    from there on nothing new can happen.
+    An unknown number of rounds is simulated until an arrangement of the objects recurs: nothing new can
+    happen from there on.
     """
     support, seen = dict(task.initial), [dict(task.initial)]
     for round_ in range(1, (MAX_REPEAT if task.repeat == "unknown" else task.repeat) + 1):

@@ -26,17 +26,25 @@ MAPPED = "or [columns] in rig.toml (hmmseg inspect proposes it)"
 
 @dataclass(frozen=True, repr=False)
 class Trial(Tabled):
-    """One recording: times `t` (num_timesteps,) [s] and channels by name, NaN where missing.
+    """One recording: times and channels by name, NaN where missing.
 
-    `origin` is where t = 0 lies, in ns since 1970, if the file says; `interpolated` marks, for
-    channels of a log, the samples that lie between two messages; `warnings` say what is unlikely,
-    `notes` what was found out on the way. `hidden`: properties that this hand cannot reveal, with the
-    reason. `touch_sd` [m]: how well the distance at which the fingers touch a block is known, but for noise;
-    `touches` [s]: times of touch and release known apart from forces, with their standard deviations;
-    `timing` (num_timesteps,) [s]: how uncertain it is when a force changed that changes there. Of a sensor
-    in the wrist, whose forces are halved between the fingers, `inertia` (num_timesteps, 2) [N]: by how much
-    the tool's own share may be wrong across and up, and `free` (num_timesteps,): 1 where the opening says
-    that nothing is held, 0 elsewhere; None of fingertips.
+    Attributes:
+        file: path or name of the source.
+        t: (num_timesteps,) [s].
+        channels: (num_timesteps,) each, in SI units.
+        origin: where t = 0 lies in ns since 1970, if the file says.
+        interpolated: for channels of a log, samples between two messages.
+        warnings: what is unlikely about the recording.
+        notes: what was found out while reading it.
+        hidden: properties that this hand cannot reveal, with the reason.
+        touch_sd: systematic uncertainty of the distance at which the fingers touch a block [m].
+        touches: times of touch and release known apart from forces, with their standard deviations [s].
+        timing: (num_timesteps,) uncertainty of the time at which a force changes [s].
+        inertia: (num_timesteps, 2), only of a wrist sensor, whose forces are halved between the fingers:
+            standard error of the tool's own share, across and up [N].
+        free: (num_timesteps,), only of a wrist sensor: 1 where the opening shows that nothing is held, else
+            0.
+        faults: of sensors (`hmmseg.hand.sensing`).
     """
 
     file: str
@@ -60,28 +68,28 @@ class Trial(Tabled):
 
         Args:
             source: a file of any kind, a DataFrame (pandas, polars), a dict of arrays (num_timesteps,), or a
-                trial, which is given back as it is.
-            rig: the hand, which says which channels there are and how columns map to them: a `rig.toml`, its
-                table as a dict, or a `Rig`.
-            task: of a plain ordered task its description, instead of or with `rig`.
+                trial, which is returned as it is.
+            rig: the hand, which defines the channels and their mapping to columns: a `rig.toml`, its table
+                as a dict, or a `Rig`.
+            task: the description of a plain ordered task, instead of or with `rig`.
 
         Returns:
             The trial in SI units: times (num_timesteps,) [s] and channels by name, NaN where missing.
 
         Raises:
-            InputError: names the file, row or column at fault and what was expected; also where the recording
-                cannot be what it says (other units, flipped signs, swapped fingers).
+            InputError: names the file, row or column at fault and what was expected; also if the recording
+                contradicts its description (other units, flipped signs, swapped fingers).
         """
         if isinstance(source, Trial):
             return source
         hand = None if rig is None else Rig.read(rig)
         order = None if task is None else Task.read(task)
-        from hmmseg.hand.read import read_trial  # above: what a hand's recording cannot be is judged there
+        from hmmseg.hand.read import read_trial  # the only import upwards: hands judge their recordings
 
         return read_trial(source, hand, order if isinstance(order, SequenceTask) else None)
 
     def tables(self) -> list[Any]:
-        """Its channels, with how many samples each lacks and how far it goes."""
+        """Its channels, with the number of missing samples and the range of each."""
         size, rows = f"{self.t.size} samples at {self.rate:.4g} Hz", []
         for name, values in self.channels.items():
             there = values[np.isfinite(values)]
@@ -108,9 +116,9 @@ class Trial(Tabled):
 
 
 def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bool = True) -> Trial:
-    """Trial from a table as it was read, whether or not it can be; InputError where it cannot.
+    """Trial from a table, before any checks of the hand; InputError for invalid columns.
 
-    `whole`: all of a recording, whose channels must have some values.
+    `whole`: whether it is a whole recording, all of whose channels must have some values.
     """
     names, optional = channels_of(rig, task)
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
@@ -121,23 +129,23 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
     _check_names(table, columns, names, optional, task is not None)
     t, origin = mapped_times(table, rig)
     channels: dict[str, np.ndarray] = {}
-    if names is None:  # all channels of a plain task: what is mapped by our name, the rest by its own
+    if names is None:  # all channels of a plain task, by our names where they are mapped
         mapped = {source_of(name, columns): name for name in columns}
         names = tuple(mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t")
     for name in names:
-        theirs_name = source_of(name, columns)
-        if theirs_name not in table.columns:
+        theirs = source_of(name, columns)
+        if theirs not in table.columns:
             continue
-        values = _mapped(numbers(table, theirs_name), name, columns, table)
+        values = _to_si(numbers(table, theirs), name, columns, table)
         beyond = np.flatnonzero(np.abs(np.nan_to_num(values)) > LARGEST)
         if task is None and beyond.size:
-            raise InputError(f"{table.file}: row {table.rows[beyond[0]]}, column {theirs_name}",
+            raise InputError(f"{table.file}: row {table.rows[beyond[0]]}, column {theirs}",
                              f"{values[beyond[0]]:.3g} is no reading of a hand's sensor",
                              f"at most {LARGEST:.0g} in SI units")  # fmt: skip
         if not whole or np.isfinite(values).any():
             channels[name] = unwrapped(values) if measures(name) == "angle" and task is None else values
-        elif name not in optional:  # an optional one without values is as good as absent
-            raise InputError(f"{table.file}: column {theirs_name}", "has no values", "at least one number")
+        elif name not in optional:  # an optional channel without values counts as absent
+            raise InputError(f"{table.file}: column {theirs}", "has no values", "at least one number")
     between = {
         name: table.interpolated[source_of(name, columns)]
         for name in channels if source_of(name, columns) in table.interpolated
@@ -146,19 +154,19 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
 
 
 def mapped_times(table: Table, rig: Rig | None) -> tuple[np.ndarray, int | None]:
-    """Times (num_rows,) [s], and where their zero lies in ns since 1970; InputError where they cannot be."""
+    """Times (num_rows,) [s], and where their zero lies in ns since 1970; InputError for invalid times."""
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
     name = source_of("t", columns)
     if name not in table.columns:
         raise InputError(f"{table.file}: column {name}", "missing", f"a column of times in s, {MAPPED}")
     stamps, origin = times(table, name)
-    t = _mapped(stamps, "t", columns, table)
+    t = _to_si(stamps, "t", columns, table)
     _check_times(t, table)
     return t, origin
 
 
 def channels_of(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
-    """Channels of the hand or the task (None: all there are), and which of them may be absent."""
+    """Channels of the hand or the task (None: all columns), and which of them are optional."""
     if task is not None:
         return task.channels, ()
     assert rig is not None
@@ -194,8 +202,8 @@ def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, 
         raise InputError(where, "has no columns but t", "at least one channel")
 
 
-def _mapped(values: np.ndarray, ours: str, columns: Mapping[str, Column], table: Table) -> np.ndarray:
-    """Values in SI: the mapping's unit, or the one that the file itself states."""
+def _to_si(values: np.ndarray, ours: str, columns: Mapping[str, Column], table: Table) -> np.ndarray:
+    """Values in SI, by the unit of the mapping or else the one that the file states."""
     entry = columns.get(ours, Column())
     unit = entry.unit if entry.unit is not None else table.units.get(source_of(ours, columns), 1.0)
     if unit == 1.0 and entry.sign == 1 and entry.offset == 0:
@@ -219,7 +227,7 @@ def _check_times(t: np.ndarray, table: Table) -> None:
 
 
 def position_pairs(trial: Trial) -> list[tuple[str, str]]:
-    """Names of each position with its velocity, where both are recorded."""
+    """Names of each position and its velocity, where both are recorded."""
     named = [(f"q{i}{j}", f"dq{i}{j}") for i in "12" for j in "12"]
     named += [(f"{axis}{i}", f"v{axis}{i}") for i in "12" for axis in "xy"]
     return [pair for pair in named if all(name in trial.channels for name in pair)]

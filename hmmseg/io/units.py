@@ -1,7 +1,7 @@
-"""Units of other people's files, and the mapping between our channels and their columns or messages.
+"""Units of other people's files, and the mapping of their columns or messages to our channels.
 
-In `rig.toml`, `[columns]` is for tables and `[topics]` for logs made of messages; both say for
-one of our channels where it comes from, in which unit, with which sign, and what to add:
+In `rig.toml`, `[columns]` (for tables) and `[topics]` (for logs of messages) define the source, unit, sign
+and offset of a channel:
 
     [columns]
     t = {from = "stamp", unit = "ns"}
@@ -9,8 +9,8 @@ one of our channels where it comes from, in which unit, with which sign, and wha
     [topics]
     fx1 = {from = "/left/wrench.wrench.force.x"}
 
-ours = sign * theirs in SI + offset, the offset in SI. A channel that is not mapped is the column
-of its own name.
+ours = sign * theirs in SI + offset, the offset in SI. A channel that is not mapped is the column of its own
+name.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from hmmseg.errors import nearest
 from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable
 
 LARGEST = 1e9  # physics: m, N or rad; no hand's sensor reads as much, and squares of it are far from overflow
-LATEST = 1e25  # limit: of times before anything is known of their unit; ns since 1970 are 1e18
+LATEST = 1e25  # limit: of times whose unit is still unknown; ns since 1970 are 1e18
 
 # name: (what it measures, its size in SI)
 UNITS: dict[str, tuple[str, float]] = {
@@ -57,13 +57,13 @@ SPELLINGS = {
 
 
 def known_unit(text: str) -> str | None:
-    """This unit as `UNITS` spells it, None where it is unknown."""
+    """This unit as `UNITS` spells it, None if it is unknown."""
     text = re.sub(r"\s+", "", text)
     return text if text in UNITS else SPELLINGS.get(text.lower())
 
 
 def si_factor(unit: str | float) -> float:
-    """Size of a unit in SI (a number is itself: SI per count); ValueError names the nearest known one."""
+    """Size of a unit in SI (a number is SI per count itself); ValueError for an unknown unit."""
     if not isinstance(unit, str):
         return float(unit)
     name = known_unit(unit)
@@ -73,7 +73,7 @@ def si_factor(unit: str | float) -> float:
 
 
 def measures(channel: str) -> str | None:
-    """What one of our channels measures, None for a channel of a plain task."""
+    """Quantity that one of our channels measures, None for a channel of a plain task."""
     if channel == "t":
         return "time"
     if re.fullmatch(r"d?q\d\d", channel):
@@ -92,7 +92,7 @@ def unit_in_name(name: str) -> str | None:
     if len(last) < 2:
         return None
     unit = known_unit(last[-1])
-    # a bare letter is rather a name (`joint_s`, `tip_m`) unless it is one that is written so
+    # A single letter is more likely a name (`joint_s`, `tip_m`), except for the usual units.
     return unit if unit is not None and (len(unit) > 1 or unit in ("s", "m", "N")) else None
 
 
@@ -107,7 +107,7 @@ def unwrapped(angles: Any) -> Any:
 
 
 class Quantity(StrictTable):
-    """What has a unit: SI where none is said, or a number, SI per count."""
+    """A quantity with a unit: SI by default, a name, or a number (SI per count)."""
 
     unit: Name | FinitePositive | None = None
 
@@ -125,7 +125,7 @@ class Quantity(StrictTable):
 
 
 class Column(Quantity):
-    """Where one channel comes from: theirs, its unit, sign and offset [SI]."""
+    """Source of one channel: their name, its unit, sign and offset [SI]."""
 
     source: Name | None = Field(default=None, alias="from")
     sign: Finite = 1.0
@@ -157,6 +157,6 @@ Columns = Annotated[dict[Name, ColumnEntry], AfterValidator(_dimensions)]
 
 
 def source_of(name: str, columns: Mapping[str, Column]) -> str:
-    """Their name of our channel."""
+    """Their name for our channel."""
     entry = columns.get(name)
     return name if entry is None or entry.source is None else entry.source

@@ -1,9 +1,8 @@
-"""Signals, or any channels, stacked over time with the subtasks of a segmentation behind them."""
+"""Signals, or any channels, stacked over time, with the subtasks of a segmentation behind them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -19,26 +18,19 @@ from hmmseg.segmentation.spans import Segmentation
 LABEL_SLANT = 40  # look: degrees
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One signal over time: its axis label and values (num_timesteps,) as shown."""
-
-    label: str
-    values: np.ndarray
-
-
 def stacked_panels(
-    figure: Figure, t: np.ndarray, panels: Sequence[Panel], segmentation: Segmentation
+    figure: Figure, t: np.ndarray, panels: Mapping[str, np.ndarray], segmentation: Segmentation
 ) -> list[Axes]:
-    """Draw signals at t (num_timesteps,) [s], one above the other, and the subtasks behind them."""
+    """Draw signals (num_timesteps,) by label at times t [s] in stacked panels, with the subtasks behind
+    them."""
     axes = list(np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)))
-    for ax, panel in zip(axes, panels, strict=True):
-        # Single samples between missing ones would not show as a line.
-        there = np.r_[False, np.isfinite(panel.values), False]
+    for ax, (label, values) in zip(axes, panels.items(), strict=True):
+        # Single samples between missing ones would be invisible in a line.
+        there = np.r_[False, np.isfinite(values), False]
         alone = there[1:-1] & ~there[:-2] & ~there[2:]
-        ax.plot(t, panel.values, color=INK, lw=0.8)
-        ax.plot(t[alone], panel.values[alone], ".", color=INK, ms=1.5)
-        ax.set_ylabel(panel.label)
+        ax.plot(t, values, color=INK, lw=0.8)
+        ax.plot(t[alone], values[alone], ".", color=INK, ms=1.5)
+        ax.set_ylabel(label)
         ax.margins(y=0.08)
         shade_spans(ax, segmentation)
     figure.align_ylabels(axes)
@@ -57,7 +49,7 @@ def stacked_panels(
 
 
 def shade_spans(ax: Axes, segmentation: Segmentation) -> None:
-    """Colour the subtasks by state; boundaries as a thin line in their 90 % interval."""
+    """Colour the subtasks by state; draw boundaries as a thin line in their 90 % interval."""
     colours = state_colours([span.state for span in segmentation.spans])
     for span in segmentation.spans:
         ax.axvspan(span.start, span.end, color=colours[span.state], alpha=0.32, lw=0, zorder=0)
@@ -67,7 +59,7 @@ def shade_spans(ax: Axes, segmentation: Segmentation) -> None:
 
 
 def name_spans(ax: Axes, segmentation: Segmentation) -> None:
-    """Subtask names above a panel, slanted so that short subtasks keep theirs."""
+    """Write the subtasks' names above a panel, slanted so that short ones fit."""
     for span in segmentation.spans:
         anchor = 0.65 * span.start + 0.35 * span.end
         ax.annotate(
@@ -78,19 +70,19 @@ def name_spans(ax: Axes, segmentation: Segmentation) -> None:
 
 
 def draw_signals(signals: Signals, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
-    """Mean position, finger distance, grip, net and shear forces over coloured subtasks.
+    """Plot mean position, finger distance, grip, net and shear forces over coloured subtasks.
 
     After the paper's Figures 5 to 7.
     """
-    panels = [
-        Panel("Mean $x$\n[cm]", 100 * signals.x),
-        Panel("Mean $y$\n[cm]", 100 * signals.y),
-        Panel("Distance\n[cm]", 100 * signals.distance),
-        Panel("Grip\n[N]", signals.grip),
-        Panel("Net $f_x$\n[N]", signals.fx),
-        Panel("Net $f_y$\n[N]", signals.fy),
-        Panel("Shear\n[N]", signals.shear),
-    ]
+    panels = {
+        "Mean $x$\n[cm]": 100 * signals.x,
+        "Mean $y$\n[cm]": 100 * signals.y,
+        "Distance\n[cm]": 100 * signals.distance,
+        "Grip\n[N]": signals.grip,
+        "Net $f_x$\n[N]": signals.fx,
+        "Net $f_y$\n[N]": signals.fy,
+        "Shear\n[N]": signals.shear,
+    }
     with canvas(path, height=8.2) as figure:
         return stacked_panels(figure, signals.t, panels, segmentation)
 
@@ -99,9 +91,9 @@ MOST = 12  # look: panels that stay legible on one page
 
 
 def draw_channels(trial: Trial, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
-    """Every channel of a trial, the first twelve at most, over coloured subtasks, in its own units."""
+    """Plot every channel of a trial, MOST at most, over coloured subtasks, in its own units."""
     names = list(trial.channels)[:MOST]
-    panels = [Panel(name, trial.channels[name]) for name in names]
+    panels = {name: trial.channels[name] for name in names}
     with canvas(path, height=1.8 + 0.95 * len(panels)) as figure:
         axes = stacked_panels(figure, trial.t, panels, segmentation)
         left_out = len(trial.channels) - len(names)

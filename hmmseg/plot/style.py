@@ -1,4 +1,4 @@
-"""What figures of every floor share: style, colour-blind safe colours, units for the eye, saving."""
+"""Style that all figures share: colour-blind safe colours, fonts, sizes, saving."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def canvas(
     height: float = 3.0,
     layout: Literal["constrained"] | None = "constrained",
 ) -> Iterator[Figure]:
-    """An empty figure of this size [in]; saved to `path` (kind by its suffix) when the block ends.
+    """An empty figure of this size [in], saved to `path` (kind by its suffix) when the block ends.
 
-    No pyplot: nothing is left open and no display is needed. Without a path the figure is the
-    caller's to show: pyplot's in a notebook, which shows it below the cell, and where a script has loaded it.
+    Without pyplot: nothing stays open and no display is needed. Without a path the caller shows the figure;
+    in a notebook, or if a script has loaded pyplot, it is one of pyplot's.
     """
     with matplotlib.rc_context(STYLE):
         if path is None and not sys.modules.keys().isdisjoint(("matplotlib.pyplot", "ipykernel")):

@@ -1,19 +1,17 @@
-"""What recordings show without labels, and which of its changes are the boundaries that the task names.
+"""Courses: ways to align unlabelled trials, and which of their changes are the boundaries that a task names.
 
-Courses are ordered models of more stretches than their task has states, learned from many starts: optimal
-partitions of single trials into a given number of stretches (dynamic programming, Jackson et al., IEEE
-Signal Process. Lett. 12, 2005, with a Gaussian cost per stretch), whose stretches teach all trials. Stretch
-k is the same in all trials of a course. Where trials can be aligned in several ways, courses differ, and
-nothing in one of them says how far to trust it: all are kept.
+A course is an ordered model of more stretches than the task has states; stretch k is the same in all trials.
+Each starts from an optimal partition of one trial (dynamic programming, Jackson et al., IEEE Signal Process.
+Lett. 12, 2005, with a Gaussian cost per stretch), whose stretches initialise the other trials. Where trials
+can be aligned in several ways, courses differ, and none of them shows how far to trust it: all are kept.
 
-Every way to choose the named boundaries among the changes of a course counts: their sum is exact, and so are
-the probabilities that a boundary is this change or that (forward and backward over the changes, as
-Fearnhead, Stat. Comput. 16, 2006, over samples). After the last named state something may settle that no one
-named.
+The posterior that a named boundary is a given change of a course sums over all choices exactly (forward and
+backward over the changes, as Fearnhead, Stat. Comput. 16, 2006, over samples). An unnamed settled state may
+follow the last named one.
 
-How probable a choice is: emissions are wrong in ways that all samples of all trials share, so evidence must
-not grow with their number. It is that of a coarsened posterior (Miller and Dunson, J. Am. Stat. Assoc. 114,
-2019): samples count as if they were `independent` ones, however many there are.
+The emission model is wrong in ways that all samples share, so evidence must not grow with their number: a
+coarsened posterior (Miller and Dunson, J. Am. Stat. Assoc. 114, 2019) counts all samples as at most
+`independent` observations.
 """
 
 from __future__ import annotations
@@ -26,19 +24,18 @@ import numpy as np
 from scipy.special import softmax
 
 from hmmseg.sequence.emissions import FLOORS, Learner
-from hmmseg.sequence.features import filled
+from hmmseg.sequence.features import fill_gaps
 
-MAX_BLOCKS = 250  # numerics: the cost table is quadratic in it
+MAX_BLOCKS = 250  # numerics: the cost table is quadratic in this
 
 
 def partition(
     values: np.ndarray, num_stretches: int, floor: float, cuts: Sequence[int] | np.ndarray = ()
 ) -> np.ndarray:
-    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 of least total cost.
+    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 with the least total cost.
 
-    A stretch of n blocks costs n/2 log(variance + floor^2) per column of `values` (num_cells,
-    num_features), which must be finite; none crosses the cells `cuts`. ValueError where there are
-    fewer cells than stretches.
+    A stretch of n blocks costs n/2 log(variance + floor^2) per column of `values` (num_cells, num_features),
+    which must be finite; no stretch crosses the cells `cuts`. ValueError for fewer cells than stretches.
     """
     num_cells = len(values)
     if num_cells < num_stretches:
@@ -63,9 +60,9 @@ def partition(
 
 
 def pooled_costs(count: np.ndarray, first: np.ndarray, second: np.ndarray, floor: float) -> np.ndarray:
-    """Cost [a, b] (N + 1, N + 1) of the parts a <= k < b as one stretch, inf where it is empty.
+    """Cost [a, b] (N + 1, N + 1) of merging the parts a <= k < b into one stretch, inf for an empty one.
 
-    `count` (N,): cells of each part, `first`, `second` (N, num_features): sums of values and of squares.
+    `count` (N,): cells in each part; `first`, `second` (N, num_features): sums of values and of squares.
     """
     n, x, x2 = (np.concatenate([np.zeros((1, *v.shape[1:])), np.cumsum(v, axis=0)])
                 for v in (count.astype(float), first, second))  # fmt: skip
@@ -78,23 +75,25 @@ def pooled_costs(count: np.ndarray, first: np.ndarray, second: np.ndarray, floor
     return np.where(np.tri(len(n), dtype=bool), np.inf, cost)
 
 
-COARSE_CELLS = 300  # numerics: a trial, on the grid on which courses are learned
-MULTIPLES = (2, 3)  # chosen: stretches a named state, and one more
-START_FLOORS = (0.1, 0.4)  # numerics: of the partitions of single trials from which EM starts
-TEACHERS = 4  # numerics: trials whose partition is a start for all trials
-SAME = 0.005  # numerics: of a trial: courses whose changes are as close are one
-MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch: a quiet channel says no more than the others
+COARSE_CELLS = 300  # numerics: cells per trial on the grid on which courses are learned
+MULTIPLES = (2, 3)  # chosen: stretches per named state, plus one
+START_FLOORS = (0.1, 0.4)  # numerics: scale floors of the single-trial partitions from which EM starts
+TEACHERS = 4  # numerics: trials whose partition is tried as a start for all trials
+SAME = 0.005  # numerics: share of a trial; courses whose changes are this close are duplicates
+MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch, so that quiet channels do not dominate
 
 
 @dataclass(frozen=True)
 class Course:
-    """One way to align all trials.
+    """One alignment of all trials.
 
-    `probability` [(num_cells, num_stretches), ...]: of stretches, on the coarse grid. `ends` (num_trials,
-    num_stretches - 1): where they end, as shares of the trial. `cost` [a, b] (num_stretches + 1, ...): of
-    stretches a <= k < b as one state, nats as if each cell were one independent observation. `share`: of
-    independent observations in what the stretches leave. `seen` (num_stretches - 1,): log probability that
-    a change is there and no stretch of one level cut in two.
+    Attributes:
+        probability: [(num_cells, num_stretches), ...] of each stretch, on the coarse grid.
+        ends: (num_trials, num_stretches - 1), ends of stretches as shares of the trial.
+        cost: [a, b] (num_stretches + 1, ...) of stretches a <= k < b as one state, in nats with every cell
+            counted as one independent observation.
+        share: independent observations per cell, from the residuals.
+        seen: (num_stretches - 1,) log probability that a change is real, not one level cut in two.
     """
 
     probability: list[np.ndarray]
@@ -105,15 +104,15 @@ class Course:
 
     @property
     def observations(self) -> float:
-        """Independent observations in all trials."""
+        """Number of independent observations in all trials."""
         return self.share * sum(len(p) for p in self.probability)
 
 
 def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
-    """Courses of trials `values` [(num_cells, num_features), ...] on a coarse grid, all different.
+    """Distinct courses of trials `values` [(num_cells, num_features), ...] on a coarse grid.
 
     `labels` [(num_states - 1,), ...]: known boundaries as shares of each trial, NaN where unknown. Labelled
-    trials teach first, and their stretches end where the labels are.
+    trials are tried first as starts, with stretches that end at the labels.
     """
     most = max(num_states, min(map(len, values)) // 2)
     numbers = dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES)
@@ -122,31 +121,31 @@ def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence
     teachers = list(dict.fromkeys([*labelled, *spread.tolist()]))[:TEACHERS]
     found: list[Course] = []
     for number, i, floor in itertools.product(numbers, teachers, START_FLOORS):
-        course = _taught(values, number, i, floor, labels[i])
+        course = _learn_course(values, number, i, floor, labels[i])
         same = [other for other in found if other.ends.shape == course.ends.shape]
         if not any(np.abs(other.ends - course.ends).max(initial=0.0) < SAME for other in same):
             found.append(course)
     return found
 
 
-def _taught(
+def _learn_course(
     values: Sequence[np.ndarray], number: int, teacher: int, floor: float, known: np.ndarray
 ) -> Course:
-    """The course that starts from the optimal partition of one trial, whose stretches teach the others."""
+    """EM from the optimal partition of trial `teacher`, with `known` boundaries, into `number` stretches."""
     names, features = [f"{k}" for k in range(number)], values[0].shape[1]
-    temper = 1 / features  # while learning, a cell counts as one observation
+    temper = 1 / features  # during EM a cell counts as one observation
     cells = len(values[teacher])
     cuts = np.unique(np.clip((known[np.isfinite(known)] * cells).round().astype(int), 1, cells - 1))
-    path = partition(np.arcsinh(filled(values[teacher])), number, floor, cuts)
+    path = partition(np.arcsinh(fill_gaps(values[teacher])), number, floor, cuts)
     alone = Learner([values[teacher]], names, [False] * number)
-    taught, start = alone.run([np.eye(number)[path]], temper, FLOORS[1:3], steps=1)
+    initial, start = alone.run([np.eye(number)[path]], temper, FLOORS[1:3], steps=1)
     paths = [path if cuts.size and i == teacher else None for i in range(len(values))]
     learner = Learner(list(values), names, [False] * number, known=paths)
-    aligned = learner.align(taught, learner.law(start))
+    aligned = learner.align(initial, learner.law(start))
     emissions, probability = learner.run([a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
     paths = [p.argmax(1) for p in probability]
-    one_hot, stacked = np.eye(number)[np.concatenate(paths)], np.vstack([filled(v) for v in values])
+    one_hot, stacked = np.eye(number)[np.concatenate(paths)], np.vstack([fill_gaps(v) for v in values])
     x = np.arcsinh(stacked)
     cost = pooled_costs(one_hot.sum(0), one_hot.T @ x, one_hot.T @ x**2, MERGE_FLOOR) / features
     share = learner.tempered(emissions, probability).temper * features
@@ -154,12 +153,12 @@ def _taught(
 
 
 def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, share: float) -> np.ndarray:
-    """Log probability (number - 1,) of each change against one state on either side of it.
+    """Log probability (number - 1,) that each change is real, against one state on both sides of it.
 
-    Of as many independent observations as both stretches have: each side has a mean and a variance of its
-    own for each channel (Schwarz), and the change is as likely between any two cells of a trial.
+    By `share` independent observations per cell: each side has its own mean and variance per channel (Schwarz
+    criterion), and the change is equally likely between any two cells of a trial.
     """
-    bridged = [np.arcsinh(filled(v)) for v in values]
+    bridged = [np.arcsinh(fill_gaps(v)) for v in values]
     stacked, path = np.vstack(bridged), np.concatenate(paths)
     features = stacked.shape[1]
     out = np.zeros(number - 1)
@@ -181,8 +180,8 @@ def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int,
     return out
 
 
-def coarse(values: np.ndarray, factor: int) -> np.ndarray:
-    """Means over `factor` neighbouring cells; a mean without a cell is NaN."""
+def coarsen(values: np.ndarray, factor: int) -> np.ndarray:
+    """Means over `factor` neighbouring cells (NaN if none has a value)."""
     known = np.isfinite(values)
     starts = np.arange(0, len(values), factor)
     count = np.add.reduceat(known.astype(float), starts, axis=0)
@@ -190,20 +189,22 @@ def coarse(values: np.ndarray, factor: int) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-LEAST_SHARE = 1e-3  # numerics: of a trial, for a duration's logarithm
-NEAR = 0.02  # chosen: of a trial: boundaries as close are the same
+LEAST_SHARE = 1e-3  # numerics: share of a trial; shorter durations count as this in the logarithm
+NEAR = 0.02  # chosen: share of a trial within which two boundaries are the same
 
 
 @dataclass(frozen=True)
 class Weighing:
-    """What makes a choice probable, learned on sequences of many kinds (`experiments.sequences learn`).
+    """Prior weights of choices, learned on sequences of many kinds (`experiments.sequences learn`).
 
-    `independent`: observations that evidence counts as in the limit of many. `settled`: log odds of a
-    unnamed state after the last event. `shares`: exponent of the share of its trial that each state
-    but the last takes. `lag`: scale of the Laplace law by which boundaries lie off the change they are, as a
-    share of the trial; `labelled`: the same where labels say by how much. `elsewhere`: probability that a
-    boundary is at no change at all; `unseen`: how probable a change that the channels do not show is, against
-    one that they do.
+    Attributes:
+        independent: number of observations to which evidence is coarsened.
+        settled: log odds of an unnamed state after the last event.
+        shares: exponent of the share of the trial that each state but the last takes.
+        lag: scale of the Laplace law of boundaries about their change, as a share of the trial.
+        labelled: the same where labels tell the mean lag.
+        elsewhere: probability that a boundary is at no change at all.
+        unseen: prior weight of a change that the channels do not show, relative to one that they do.
     """
 
     independent: float
@@ -228,11 +229,12 @@ WEIGHING = Weighing(
 
 @dataclass(frozen=True)
 class Naming:
-    """What the changes of one course are.
+    """Which changes of one course are the named boundaries.
 
-    `log_evidence` [nats]: of the course, all choices averaged. `probability` (num_boundaries, num_changes):
-    that boundary b is change j. `settled` (num_changes,): probability that the last named state ends before
-    the recording does, at change j.
+    Attributes:
+        log_evidence: of the course [nats], averaged over all choices.
+        probability: (num_boundaries, num_changes) that boundary b is change j.
+        settled: (num_changes,) that a settled state begins at change j.
     """
 
     log_evidence: float
@@ -242,11 +244,13 @@ class Naming:
 
 @dataclass(frozen=True)
 class Choice:
-    """Changes of one course as the boundaries of its task.
+    """Changes of one course chosen as the boundaries of its task.
 
-    `course`: its index. `ends`: the changes, from 1 on, that end the named states; where something `settled`
-    follows, the last of them ends the last state. `right` (num_boundaries,): probability that each boundary
-    is within NEAR of there.
+    Attributes:
+        course: its index.
+        ends: changes, numbered from 1, that end the named states, the last one only if `settled`.
+        settled: whether a settled state follows the last named one.
+        right: (num_boundaries,) probability that each boundary is within NEAR of the chosen change.
     """
 
     course: int
@@ -260,10 +264,10 @@ def naming(
 ) -> Naming:
     """Sum over all choices of `num_states` - 1 >= 1 boundaries among the changes of a course.
 
-    `labels` [(num_states - 1,), ...] of each trial: known boundaries as shares of it, NaN where unknown.
+    `labels` [(num_states - 1,), ...]: known boundaries of each trial as shares of it, NaN where unknown.
     """
-    # Log weights of stretches a <= k < b as one named state [a, b], of those from a on as the last [a], and
-    # as the last followed by a settled one from e on [a, e]; of a change as an end of a state, seen or not.
+    # Log weights: groups [a, b] of stretches a <= k < b as one named state; tail [a] of those from a on as
+    # the last one, and end [a, e] with a settled state from e on; change of a change that ends a state.
     temper = weighing.independent * course.share / (weighing.independent + course.observations)
     evidence = np.where(np.isfinite(course.cost), -temper * course.cost, -np.inf)
     edges = np.column_stack([np.zeros(len(course.ends)), course.ends, np.ones(len(course.ends))])
@@ -284,14 +288,14 @@ def naming(
     joint = np.array([one + other for one, other in zip(ahead, behind[::-1], strict=True)])[:, 1:number]
     total = float(np.logaddexp.reduce(joint[0]))
     last = np.exp(ahead[-1][:, None] + end - total)[:, 1:number].sum(0)
-    choices = np.r_[0.0, np.full(num_states - 1, -np.inf)]  # log of their weights' sum, by number chosen
+    choices = np.r_[0.0, np.full(num_states - 1, -np.inf)]  # log normaliser, by number of changes chosen
     for each in change:
         choices[1:] = np.logaddexp(choices[1:], choices[:-1] + each)
     return Naming(total - float(choices[-1]), np.exp(joint - total), last)
 
 
 def label_weights(course: Course, labels: Sequence[np.ndarray], weighing: Weighing) -> np.ndarray:
-    """Log density (num_boundaries, num_changes + 2) of the labels, were boundary b change j (from 1 on)."""
+    """Log density (num_boundaries, num_changes + 2) of the labels if boundary b is change j (from 1)."""
     out = np.zeros((len(labels[0]), course.ends.shape[1] + 2))
     for ends, known in zip(course.ends, labels, strict=True):
         for b in np.flatnonzero(np.isfinite(known)):
@@ -306,7 +310,7 @@ def probabilities(namings: Sequence[Naming]) -> np.ndarray:
 
 
 def best_choice(courses: Sequence[Course], namings: Sequence[Naming], probability: np.ndarray) -> Choice:
-    """The choice with the most boundaries expected right, were one of all courses and choices true."""
+    """The choice with the greatest expected number of correct boundaries, over all courses and choices."""
     best, answer = -np.inf, None
     for i, (course, own) in enumerate(zip(courses, namings, strict=True)):
         right = np.zeros_like(own.probability)
@@ -327,7 +331,7 @@ def best_choice(courses: Sequence[Course], namings: Sequence[Naming], probabilit
 
 
 def _increasing(right: np.ndarray) -> tuple[float, list[int]]:
-    """Increasing columns (one a row) of `right` with the greatest sum, and that sum."""
+    """Increasing column indices, one per row of `right`, with the greatest sum, and that sum."""
     total, source = right[0], []
     for row in right[1:]:
         source.append([0, *(int(total[:j].argmax()) for j in range(1, row.size))])

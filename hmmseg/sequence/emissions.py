@@ -1,18 +1,16 @@
-"""The model of a plain ordered task, and its EM: what states and boundaries look like, how states follow.
+"""Emissions, boundary templates and transitions of a plain ordered task, and EM over its trials.
 
-States have independent Student t features, tempered for dependence: neighbouring cells and different
-channels repeat each other's evidence, and multiplying their likelihoods as if independent would make
-boundaries overconfident. So the log-likelihood is multiplied by `temper`, the share of independent
-observations: one over the integrated autocorrelation time of the residuals, times the effective number of
-features over their number (participation ratio of the residual correlation's eigenvalues).
+Emissions are independent Student t densities of the features. Neighbouring cells and correlated channels
+repeat each other's evidence, so the log-likelihood is multiplied by `temper`, the share of independent
+observations: the reciprocal integrated autocorrelation time of the residuals, times the effective over the
+actual number of features (participation ratio of the eigenvalues of the residual correlation).
 
-A labelled boundary often lies at a fixed lag from what the channels show (a controller switches, contact
-follows). For every boundary the course of all channels in a window around it, without the window's mean, is
-compared with what such windows look like anywhere: a log-likelihood ratio per candidate time, added to the
-log weight of advancing. Nothing in it knows the time of day or the time since the start.
+A labelled boundary often has a fixed lag to what the channels show. Each boundary therefore has a template:
+the course of all channels in a window around it, less the window's mean. Its log-likelihood ratio against
+windows anywhere adds to the log weight of advancing. It is invariant to time shifts.
 
-Durations are geometric on the grid with a learned mean: the one law that a crop at the start does not
-disturb, and a wide one, so that the clock does not decide. States may be skipped.
+Durations are geometric with a learned mean: memoryless, so that cropping the start does not matter, and wide,
+so that time alone decides little. Optional states may be skipped.
 """
 
 from __future__ import annotations
@@ -27,10 +25,10 @@ from hmmseg.hmm import Chain, left_to_right
 from hmmseg.hmm.inference import align
 from hmmseg.hmm.results import AlignmentPosterior
 
-DOF = 4.0  # cited: heavy tails: a transient moves neither location nor scale much
-ONE_CELL = 1e-9  # numerics: a state without even so much weight is left as it is
-FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM settles
-STEPS_PER_FLOOR = 4  # numerics: of EM
+DOF = 4.0  # cited: degrees of freedom, Lange, Little and Taylor 1989; limits the weight of transients
+ONE_CELL = 1e-9  # numerics: weight [cells] below which a state is not updated
+FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM converges
+STEPS_PER_FLOOR = 4  # numerics: EM steps at each floor
 LEAST_CELLS = 1.5  # numerics: least mean duration of a state
 
 
@@ -43,7 +41,7 @@ class StudentEmissions:
     temper: float = 1.0
 
     def log_likelihoods(self, values: np.ndarray) -> np.ndarray:
-        """Tempered log-likelihoods (num_cells, num_states); a missing feature adds nothing."""
+        """Tempered log-likelihoods (num_cells, num_states); missing features contribute nothing."""
         z2 = ((values[:, None] - self.loc) / self.scale) ** 2
         constant = gammaln((DOF + 1) / 2) - gammaln(DOF / 2) - np.log(np.pi * DOF) / 2
         log_density = constant - np.log(self.scale) - (DOF + 1) / 2 * np.log1p(z2 / DOF)
@@ -54,8 +52,8 @@ def update(emissions: StudentEmissions, values: np.ndarray, weights: np.ndarray,
            floor: float) -> StudentEmissions:  # fmt: skip
     """One EM step for location and scale (Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 1989).
 
-    `values` (num_cells, num_features) of all trials, `weights` (num_cells, num_states) the
-    posterior state probabilities; scales are kept above `floor`.
+    `values` (num_cells, num_features) of all trials; `weights` (num_cells, num_states): posterior state
+    probabilities; scales are at least `floor`.
     """
     loc, scale = emissions.loc.copy(), emissions.scale.copy()
     known = np.isfinite(values)
@@ -72,7 +70,7 @@ def update(emissions: StudentEmissions, values: np.ndarray, weights: np.ndarray,
 
 def from_weights(values: np.ndarray, weights: np.ndarray, floor: float, temper: float,
                  iterations: int = 10) -> StudentEmissions:  # fmt: skip
-    """Emissions for given posterior state probabilities, from moments on."""
+    """Emissions for given posterior state probabilities: EM from their weighted moments."""
     known = np.isfinite(values)
     x = np.where(known, values, 0.0)
     total = np.maximum(weights.T @ known, ONE_CELL)
@@ -85,7 +83,7 @@ def from_weights(values: np.ndarray, weights: np.ndarray, floor: float, temper: 
 
 
 def independent_share(trials: Sequence[np.ndarray]) -> float:
-    """Share of independent observations in residuals [(num_cells, num_features), ...]."""
+    """Independent observations per cell in residuals [(num_cells, num_features), ...]."""
     pooled = np.vstack(trials)
     spread = pooled.std(0)
     used = spread > 1e-6
@@ -98,7 +96,7 @@ def independent_share(trials: Sequence[np.ndarray]) -> float:
 
 
 def _autocorrelation_time(r: np.ndarray) -> float:
-    """Integrated autocorrelation time [cells], features pooled, up to its first crossing of 0.05."""
+    """Integrated autocorrelation time [cells], pooled over features, up to the first lag below 0.05."""
     x = r - r.mean(0)
     n = len(x)
     transform = np.fft.rfft(x, 2 * n, axis=0)
@@ -110,18 +108,20 @@ def _autocorrelation_time(r: np.ndarray) -> float:
     return float(1 + 2 * rho[1:end].sum())
 
 
-PRIOR_COUNT = 2.0  # prior: weight of the channel's own pooled spread against that of each lag
-LEAST_SPREAD = 0.05  # chosen: of a window's usual spread: labels are no better aligned than that
+PRIOR_COUNT = 2.0  # prior: weight of a channel's pooled spread against the spread at each lag
+LEAST_SPREAD = 0.05  # chosen: share of a window's usual spread; labels align no better than that
 
 
 @dataclass(frozen=True)
 class Detectors:
     """Templates of all boundaries; windows have `2 * half` cells.
 
-    `mean`, `spread` (num_boundaries, 2 * half, num_channels), `usual` (num_channels,) the spread of
-    windows anywhere; `jitter` (num_boundaries,) [cells] how much more than their posterior says
-    held-out labels scatter; `weight` multiplies the log-likelihood ratio (neighbouring cells and
-    channels are not independent), `state_weight` the state emissions.
+    Attributes:
+        mean, spread: (num_boundaries, 2 * half, num_channels) of the template.
+        usual: (num_channels,) spread of windows anywhere.
+        jitter: (num_boundaries,) [cells] scatter of held-out labels in excess of their posterior.
+        weight: factor of the log-likelihood ratio, as neighbouring cells and channels are dependent.
+        state_weight: factor of the emissions' log-likelihoods next to it.
     """
 
     half: int
@@ -133,11 +133,11 @@ class Detectors:
     state_weight: float = 1.0
 
     def crossing(self, values: np.ndarray) -> np.ndarray:
-        """Log weights (num_cells - 1, num_boundaries) of crossing, from all features of a trial."""
+        """Log weights (num_cells - 1, num_boundaries) of crossing, from the features of a trial."""
         return self.weight * self.log_ratios(values[:, : self.mean.shape[2]])
 
     def log_ratios(self, values: np.ndarray) -> np.ndarray:
-        """Unweighted log-likelihood ratios (num_cells - 1, num_boundaries), one a cell edge."""
+        """Log-likelihood ratios (num_cells - 1, num_boundaries), before weighting, at each cell edge."""
         windows = _windows(values, self.half)
         log_far = _log_density(windows, self.usual)
         return np.stack([
@@ -147,12 +147,12 @@ class Detectors:
 
 
 def _log_density(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Student t, without its constant."""
+    """Log density of a Student t, without its constant."""
     return -(DOF + 1) / 2 * np.log1p((x / scale) ** 2 / DOF) - np.log(scale)
 
 
 def _windows(values: np.ndarray, half: int) -> np.ndarray:
-    """Windows (num_cells - 1, 2 * half, num_channels) around every edge, mean removed; NaN outside."""
+    """Windows (num_cells - 1, 2 * half, num_channels) around each edge, less their mean; NaN outside."""
     gap = np.full((half - 1, values.shape[1]), np.nan)
     padded = np.concatenate([gap, values, gap])
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half, axis=0).swapaxes(1, 2)
@@ -164,9 +164,8 @@ def _windows(values: np.ndarray, half: int) -> np.ndarray:
 def learn(trials: Sequence[np.ndarray], edges: Sequence[np.ndarray], half: int) -> Detectors:
     """Templates from channels [(num_cells, num_channels), ...] and labelled edges.
 
-    `edges[i][b]` is the index of the edge (between the cells of that index and the next) at
-    boundary b of trial i; -1 where the boundary shows nothing of its own (a skipped subtask). A
-    boundary that no trial shows has ratio 0 everywhere.
+    `edges[i][b]`: the cell before boundary b of trial i; -1 where the boundary has no course of its own (a
+    skipped subtask). A boundary that no trial has gets ratio 0 everywhere.
     """
     windows = [_windows(values, half) for values in trials]
     usual = np.sqrt(np.nanmean(np.vstack(windows) ** 2, axis=(0, 1)))
@@ -185,15 +184,15 @@ def learn(trials: Sequence[np.ndarray], edges: Sequence[np.ndarray], half: int) 
 
 
 def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence[bool]) -> Chain:
-    """The chain of mean durations [cells] and the probability that an optional state occurs."""
+    """Chain of mean durations [cells], with the probabilities that optional states occur."""
     there = np.where(np.asarray(optional, bool), np.clip(presence, 1e-12, 1 - 1e-12), 1.0)
     return left_to_right(np.maximum(mean_cells, LEAST_CELLS), there)
 
 
-def detecting(chain: Chain, crossing: np.ndarray) -> Chain:
-    """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary.
+def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
+    """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary added.
 
-    Who skips subtasks crosses their boundaries.
+    A path that skips a state crosses both its boundaries.
     """
     total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
     stay, *jumps = chain.bands
@@ -208,9 +207,12 @@ def detecting(chain: Chain, crossing: np.ndarray) -> Chain:
 class Learner:
     """EM over `values` [(num_cells, num_features), ...] of all trials.
 
-    `names` of the task's states and `optional` (num_states,) say what may follow what. What labels say of
-    each trial: `known`, its path (num_cells,), which then stays as it is; `allowed` (num_cells, num_states),
-    -inf where a state is forbidden and 0 elsewhere. None where they say nothing.
+    Args:
+        values: features of each trial, NaN where missing.
+        names: of the task's states; states of one name share emissions.
+        optional: (num_states,) whether a state may be skipped.
+        known: path (num_cells,) of each fully labelled trial, which stays fixed, else None.
+        allowed: (num_cells, num_states), -inf where labels forbid a state and 0 elsewhere; None without any.
     """
 
     values: list[np.ndarray]
@@ -223,23 +225,23 @@ class Learner:
         self.known = self.known or [None] * len(self.values)
         self.allowed = self.allowed or [None] * len(self.values)
         self.num_states, self.stacked = len(self.optional), np.vstack(self.values)
-        # A name listed twice is one state that comes twice: its emissions are learned together.
+        # States of one name are one state that recurs: their emissions are learned together.
         ids = [*self.names, *range(self.num_states - len(self.names))]
         self._same = np.array([[one == other for other in ids] for one in ids], dtype=float)
 
     def law(self, probability: Sequence[np.ndarray]) -> Chain:
-        """How states follow each other, from posterior state probabilities."""
+        """Transitions, from posterior state probabilities."""
         return transitions(*durations(probability), self.optional)
 
     def emissions(self, probability: Sequence[np.ndarray], floor: float, temper: float) -> StudentEmissions:
-        """Emissions from posterior state probabilities alone."""
+        """Emissions, from posterior state probabilities alone."""
         return from_weights(self.stacked, np.vstack(probability) @ self._same, floor, temper)
 
     def align(self, emissions: StudentEmissions, law: Chain,
               detectors: Detectors | None = None) -> list[AlignmentPosterior]:  # fmt: skip
-        """Alignments of all trials, in which no state is where labels forbid it."""
+        """Posterior alignments of all trials, within what labels allow."""
         tables, chains = zip(
-            *(weighed(values, emissions, law, detectors) for values in self.values), strict=True
+            *(weigh(values, emissions, law, detectors) for values in self.values), strict=True
         )
         tables = [ll if free is None else ll + free for ll, free in zip(tables, self.allowed, strict=True)]
         return align(tables, chains)
@@ -247,7 +249,7 @@ class Learner:
     def run(self, probability: Sequence[np.ndarray], temper: float, floors: Sequence[float] = FLOORS,
             detectors: Detectors | None = None, steps: int = STEPS_PER_FLOOR,
             ) -> tuple[StudentEmissions, list[np.ndarray]]:  # fmt: skip
-        """EM from given state probabilities, `steps` at each floor of the scales; also those it ends with."""
+        """EM from given state probabilities, `steps` at each scale floor; emissions and probabilities."""
         emissions, law = self.emissions(probability, floors[0], temper), self.law(probability)
         for floor in np.repeat(floors, steps):
             probability = self.labelled([each.smoothed for each in self.align(emissions, law, detectors)])
@@ -256,26 +258,26 @@ class Learner:
         return emissions, list(probability)
 
     def labelled(self, probability: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """State probabilities, of labelled trials those of their labels."""
+        """State probabilities, replaced by the labels of fully labelled trials."""
         return [p if k is None else np.eye(self.num_states)[k]
                 for p, k in zip(probability, self.known, strict=True)]  # fmt: skip
 
     def tempered(self, emissions: StudentEmissions, probability: Sequence[np.ndarray]) -> StudentEmissions:
-        """Emissions with the share of independent observations in what they leave of the features."""
-        left = []
+        """The emissions, tempered by the share of independent observations in their residuals."""
+        residuals = []
         for values, path in zip(self.values, (p.argmax(1) for p in probability), strict=True):
             z = (values - emissions.loc[path]) / emissions.scale[path]
-            left.append(np.arctan(np.nan_to_num(z)))  # heavy tails brought in
-        return replace(emissions, temper=independent_share(left))
+            residuals.append(np.arctan(np.nan_to_num(z)))  # bounds heavy tails
+        return replace(emissions, temper=independent_share(residuals))
 
 
-def weighed(values: np.ndarray, emissions: StudentEmissions, law: Chain,
+def weigh(values: np.ndarray, emissions: StudentEmissions, law: Chain,
             detectors: Detectors | None) -> tuple[np.ndarray, Chain]:  # fmt: skip
     """Log-likelihoods (num_cells, num_states) of a trial, and its chain."""
     ll = emissions.log_likelihoods(values)
     if detectors is None:
         return ll, law
-    return detectors.state_weight * ll, detecting(law, detectors.crossing(values))
+    return detectors.state_weight * ll, add_detectors(law, detectors.crossing(values))
 
 
 def durations(probability: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

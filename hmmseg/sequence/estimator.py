@@ -1,4 +1,4 @@
-"""A scikit-learn estimator of plain ordered sequences: fit, predict, samples labelled by their state."""
+"""A scikit-learn estimator that labels the samples of ordered sequences by their state."""
 
 from __future__ import annotations
 
@@ -17,12 +17,18 @@ from hmmseg.sequence.segment import segment_sequence
 
 
 class OrderedSegmenter(ClusterMixin, BaseEstimator):
-    """States that follow one another in a known order, learned without labels or from some.
+    """Segments sequences whose states follow one another in a known order, with or without labels.
 
-    `n_states`: how many, each seen once and in order; `rate` [Hz] of the samples; `random_state`: taken and
-    not used, nothing is drawn.
-    X is one sequence (num_timesteps, num_channels), or a list of several. After `fit`, `model_` is the
-    learned model and `labels_` the states (num_timesteps,) of a single X, 0 to n_states - 1.
+    X is one sequence (num_timesteps, num_channels) or a list of several.
+
+    Args:
+        n_states: number of states, each visited once and in order.
+        rate: of the samples [Hz].
+        random_state: accepted for scikit-learn's sake; nothing is drawn.
+
+    Attributes:
+        model_: the fitted model.
+        labels_: (num_timesteps,) states 0 to n_states - 1 of X.
     """
 
     def __init__(self, n_states: Any = 2, rate: Any = 1.0, random_state: Any = None) -> None:
@@ -31,9 +37,17 @@ class OrderedSegmenter(ClusterMixin, BaseEstimator):
         self.random_state = random_state
 
     def fit(self, X: Any, y: Any = None) -> OrderedSegmenter:
-        """Learn from one sequence or several; `y`: for several, states of some (None for the others).
+        """Fit to one sequence or several.
 
-        ValueError for what is too short, not finite or of another number of channels.
+        Args:
+            X: the sequences.
+            y: for a list, states (num_timesteps,) of each sequence, None where unknown; ignored for one.
+
+        Returns:
+            The estimator itself.
+
+        Raises:
+            ValueError: a sequence is too short, not finite or has another number of channels.
         """
         several = _several(X)
         sequences = self._checked(X, reset=True)
@@ -44,7 +58,7 @@ class OrderedSegmenter(ClusterMixin, BaseEstimator):
         return self
 
     def predict(self, X: Any) -> Any:
-        """States (num_timesteps,) of one sequence, or a list of them."""
+        """States (num_timesteps,) of one sequence, or a list of those of several."""
         check_is_fitted(self, "model_")
         sequences = self._checked(X, reset=False)
         order = self._order(sequences[0].shape[1])
@@ -52,7 +66,7 @@ class OrderedSegmenter(ClusterMixin, BaseEstimator):
         for trial in self._trials(sequences):
             spans = segment_sequence([trial], order, self.model_)[0].spans
             starts, ahead = np.array([span.start for span in spans[1:]]), np.arange(1, len(spans))
-            first = np.searchsorted(trial.t, starts) - ahead  # a sample at least for each state before it
+            first = np.searchsorted(trial.t, starts) - ahead  # leaves each earlier state at least one sample
             first = np.clip(np.maximum.accumulate(first), 0, trial.t.size - len(spans)) + ahead
             out.append(np.searchsorted(first, np.arange(trial.t.size), side="right"))
         return out if _several(X) else out[0]
@@ -64,21 +78,16 @@ class OrderedSegmenter(ClusterMixin, BaseEstimator):
         return task
 
     def _checked(self, X: Any, reset: bool) -> list[np.ndarray]:
-        found = []
-        for k, each in enumerate(X if _several(X) else [X]):
-            least = max(8, 2 * self.n_states)
-            found.append(
-                validate_data(self, each, reset=reset and k == 0, dtype=float, ensure_min_samples=least)
-            )
+        least = max(8, 2 * self.n_states)
+        found: list[Any] = [
+            validate_data(self, each, reset=reset and k == 0, dtype=float, ensure_min_samples=least)
+            for k, each in enumerate(X if _several(X) else [X])
+        ]
         return found
 
     def _trials(self, sequences: Sequence[np.ndarray]) -> list[Trial]:
-        return [
-            Trial(
-                f"sequence{k}", np.arange(len(x)) / self.rate, {f"x{c}": x[:, c] for c in range(x.shape[1])}
-            )
-            for k, x in enumerate(sequences)
-        ]
+        return [Trial(f"sequence{k}", np.arange(len(x)) / self.rate, {f"x{c}": v for c, v in enumerate(x.T)})
+                for k, x in enumerate(sequences)]  # fmt: skip
 
     def _boundaries(self, trials: Sequence[Trial], y: Any) -> dict[str, list[float]]:
         out = {}

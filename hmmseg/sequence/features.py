@@ -1,8 +1,7 @@
 """Features of plain ordered tasks: any channels on an even grid, robustly standardised.
 
-Each channel gives its value and its slope across a window without a jump. Samples are averaged in cells of
-one width for all trials of a model, so that rate, gaps and uneven times do not matter; a cell without a
-sample is NaN and says nothing about the state.
+Each channel gives its value and an edge-preserving slope. Samples are averaged in cells of one width for all
+trials of a model, so that rate, gaps and uneven sampling do not matter; an empty cell is NaN.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.trial import Trial
 
 CELLS_PER_TRIAL = 1500  # numerics: resolves a boundary to under 0.1 % of a trial's duration
-FEWEST = 20  # numerics: changes of a channel; of fewer nothing is said of its rate
+FEWEST = 20  # numerics: changes of a channel below which its own sampling rate is not inferred
 SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's duration
 
 
@@ -24,8 +23,8 @@ SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's durat
 class FeatureMap:
     """From channels to features, fixed once for all trials of a model.
 
-    `step` [s] is the width of a cell, `window` [cells] what slopes look across. `center` and
-    `scale` (num_features,) standardise: values of all channels first, then their slopes.
+    `step` [s]: width of a cell; `window` [cells]: width of slopes; `center`, `scale` (num_features,):
+    standardisation, the values of all channels first, then their slopes.
     """
 
     channels: tuple[str, ...]
@@ -52,17 +51,17 @@ class SequenceFeatures:
         return (boundaries - self.edges[0]) / (self.edges[-1] - self.edges[0])
 
 
-def without_old(values: np.ndarray) -> np.ndarray:
-    """A channel (num_timesteps,) whose repeated readings are missing (NaN), where it is read at a lower rate.
+def drop_repeats(values: np.ndarray) -> np.ndarray:
+    """A channel (num_timesteps,) without repeated readings (NaN) if it is sampled at a lower rate than rows.
 
-    So it is where no two neighbours both change: what comes between two readings is the last one again.
+    That is so where no two consecutive samples both change: each repeats the last reading.
     """
     changes = np.flatnonzero(np.diff(values) != 0) + 1
     if changes.size < FEWEST or (period := int(np.diff(changes).min())) < 2:
         return values
-    begun = np.concatenate([[0], changes])
-    since = np.arange(values.size) - begun[np.searchsorted(begun, np.arange(values.size), side="right") - 1]
-    return np.where(since % period == 0, values, np.nan)
+    starts = np.concatenate([[0], changes])
+    age = np.arange(values.size) - starts[np.searchsorted(starts, np.arange(values.size), side="right") - 1]
+    return np.where(age % period == 0, values, np.nan)
 
 
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +77,7 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
     cell = np.minimum(((trial.t - start) / step).astype(int), num_cells - 1)
     means = np.full((num_cells, len(channels)), np.nan)
     for j, name in enumerate(channels):
-        x = without_old(trial.channels[name])
+        x = drop_repeats(trial.channels[name])
         finite = np.isfinite(x)
         count = np.bincount(cell[finite], minlength=num_cells)
         total = np.bincount(cell[finite], x[finite], minlength=num_cells)
@@ -86,8 +85,8 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
     return start + step * np.arange(num_cells + 1), means
 
 
-def filled(x: np.ndarray) -> np.ndarray:
-    """Missing cells bridged linearly (held at the ends), column by column."""
+def fill_gaps(x: np.ndarray) -> np.ndarray:
+    """Missing cells interpolated linearly (held at the ends), column by column."""
     out = np.zeros_like(x)
     index = np.arange(len(x))
     for j in range(x.shape[1]):
@@ -98,10 +97,10 @@ def filled(x: np.ndarray) -> np.ndarray:
 
 
 def edge_preserving_slopes(x: np.ndarray, window: int) -> np.ndarray:
-    """Slope (num_cells, num_channels) per cell, by least squares over `window` cells before, at or after it.
+    """Slope (num_cells, num_channels) by least squares over `window` cells before, around or after each cell.
 
-    Of the three windows the one that a line fits best (Kuwahara et al., Digital Processing of Biomedical
-    Images, 1976), so that a jump is in none of those that its neighbours look through.
+    Of the three windows the one with the best linear fit is used (Kuwahara et al., Digital Processing of
+    Biomedical Images, 1976), so that no slope extends across a jump.
     """
     num_cells = len(x)
     window = min(window, num_cells)
@@ -119,12 +118,12 @@ def edge_preserving_slopes(x: np.ndarray, window: int) -> np.ndarray:
 
 
 def _raw(means: np.ndarray, step: float, window: int) -> np.ndarray:
-    slopes = edge_preserving_slopes(filled(means), window) / step
+    slopes = edge_preserving_slopes(fill_gaps(means), window) / step
     return np.hstack([means, np.where(np.isfinite(means), slopes, np.nan)])
 
 
 def feature_map(trials: Sequence[Trial], channels: Sequence[str]) -> FeatureMap:
-    """Grid and standardisation learned from trials: median, and spread without the outer 2 %."""
+    """Grid and standardisation learned from trials: medians, and spreads without the outer 2 %."""
     duration = float(np.median([trial.t[-1] - trial.t[0] for trial in trials]))
     step = max(float(np.median([1 / trial.rate for trial in trials])), duration / CELLS_PER_TRIAL)
     window = max(round(SMOOTHING * duration / step), 3)
@@ -136,8 +135,7 @@ def feature_map(trials: Sequence[Trial], channels: Sequence[str]) -> FeatureMap:
 
 
 def features(trial: Trial, mapping: FeatureMap) -> SequenceFeatures:
-    """Standardised features of one trial; InputError where it lacks a channel."""
+    """Standardised features of one trial; InputError if it lacks a channel."""
     edges, means = cell_means(trial, mapping.channels, mapping.step)
-    return SequenceFeatures(
-        edges, (_raw(means, mapping.step, mapping.window) - mapping.center) / mapping.scale
-    )
+    raw = _raw(means, mapping.step, mapping.window)
+    return SequenceFeatures(edges, (raw - mapping.center) / mapping.scale)

@@ -1,4 +1,4 @@
-"""Learn a plain ordered task from trials: EM within the forced order, from labels if there are any."""
+"""Fit a plain ordered task to trials: EM within the forced order, from labels where there are any."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hmmseg.sequence.courses import (
     Course,
     Naming,
     best_choice,
-    coarse,
+    coarsen,
     find_courses,
     naming,
     probabilities,
@@ -32,34 +32,34 @@ from hmmseg.sequence.emissions import (
     Detectors,
     Learner,
     StudentEmissions,
-    detecting,
+    add_detectors,
     durations,
     learn,
 )
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures, feature_map, features
 from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states, usual_misfit
 
-Labels = Mapping[str, Any]  # a trial's name and what is known of its boundaries [s], checked here
+Labels = Mapping[str, Any]  # known boundaries [s] by name of the trial, as users give them
 HALVES = (0.0075, 0.02, 0.05)  # prior: half a window, as a share of a trial's length
 WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # prior: of templates; held-out labels choose
 STATE_WEIGHTS = (0.03, 0.2, 1.0)  # prior: of the emissions next to them, likewise
 FORGIVING = 1e-4  # prior: least probability of a held-out label, so that one odd label does not decide
-LEAST_PROBABLE = 0.002  # numerics: courses below are left out
+LEAST_PROBABLE = 0.002  # numerics: courses less probable than this are dropped
 MOST_KEPT = 16  # numerics: courses in a model
-ENOUGH = 2  # numerics: trials with all labels for boundary templates: one is left out to weigh them
+ENOUGH = 2  # numerics: fully labelled trials for boundary templates: one is left out to weigh them
 
 
 def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | None = None) -> SequenceModel:
     """Learn emissions and durations of a plain ordered task.
 
     Args:
-        trials: recordings, labelled or not; those without labels help too.
+        trials: recordings, labelled or not; unlabelled ones contribute too.
         task: the order of the subtasks.
         labels: by a trial's name (with or without its suffix) its boundaries [s], one fewer than subtasks,
             None where unknown, or {subtask: its start}; a skipped optional subtask has two equal ones.
 
     Returns:
-        The model learned.
+        The fitted model.
 
     Raises:
         InputError: trials too short for the task, missing channels or labels that do not fit.
@@ -82,7 +82,7 @@ def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | N
 
 
 def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:
-    """Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown; InputError for misfits."""
+    """Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown; InputError for invalid labels."""
     stems = [Path(trial.file).stem for trial in trials]
     for name in labels:
         if (count := stems.count(Path(name).stem)) > 1:
@@ -92,11 +92,11 @@ def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> 
         raise InputError("labels", f"none is for these trials (there are {', '.join(sorted(labels))})",
                          f"names such as {stems[0]}")  # fmt: skip
     unknown = np.full(len(task.sequence) - 1, np.nan)
-    return [unknown if each is None else _checked(each, trial, task)
+    return [unknown if each is None else _check_labels(each, trial, task)
             for each, trial in zip(given, trials, strict=True)]  # fmt: skip
 
 
-def _checked(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
+def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     where, names = f"labels of {trial.file}", task.sequence[1:]
     if isinstance(given, Mapping):
         for name in given:
@@ -130,8 +130,8 @@ def _checked(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     return boundaries
 
 
-def forbidden(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
-    """Log weights (num_cells, num_states) that keep labelled boundaries [s] to a cell; None without any.
+def label_constraints(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
+    """Log weights (num_cells, num_states) that keep labelled boundaries [s] within a cell; None without any.
 
     -inf where a label forbids a state, 0 elsewhere.
     """
@@ -146,19 +146,15 @@ def forbidden(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) 
 
 def choose_detectors(taught: Learner, data: Sequence[SequenceFeatures], boundaries: Sequence[np.ndarray],
                      paths: Sequence[np.ndarray], temper: float, law: Chain) -> Detectors:  # fmt: skip
-    """Detectors whose window and weights place held-out labels best (each trial left out once).
+    """Detectors whose window and weights place held-out labels best (leave-one-trial-out).
 
-    The score is the log probability of the labelled cell edge and its neighbours, so weights that
-    make boundaries overconfident lose. One labelled trial cannot be left
-    out: then the middle window with the emissions' own share of independent observations.
+    The score is the log probability within a cell of the label, which penalises overconfident weights.
     """
     channels = [v[:, : v.shape[1] // 2] for v in taught.values]
     cells = [np.searchsorted(d.middle, b, side="right") - 1 for d, b in zip(data, boundaries, strict=True)]
     shown = [_shown(each) for each in cells]
     length = float(np.median([len(v) for v in taught.values]))
     halves = sorted({max(round(share * length), 2) for share in HALVES})
-    if len(data) == 1:
-        return replace(learn(channels, shown, halves[len(halves) // 2]), weight=temper)
     onehot = [np.eye(law.num_states)[path] for path in paths]
     rests = [[j for j in range(len(data)) if j != i] for i in range(len(data))]
     lls = []
@@ -174,9 +170,9 @@ def choose_detectors(taught: Learner, data: Sequence[SequenceFeatures], boundari
             detectors = learn([channels[j] for j in rest], [shown[j] for j in rest], half)
             ratios = detectors.log_ratios(channels[i])
             tables += [state_weight * lls[i] for _, state_weight in grid]
-            chains += [detecting(law, weight * ratios) for weight, _ in grid]
+            chains += [add_detectors(law, weight * ratios) for weight, _ in grid]
         held_out = zip(align(tables, chains), np.repeat(np.arange(len(data)), len(grid)), strict=True)
-        scores, excess = zip(*(_judged(a.boundary, cells[i]) for a, i in held_out), strict=True)
+        scores, excess = zip(*(_held_out_score(a.boundary, cells[i]) for a, i in held_out), strict=True)
         mean = np.reshape(scores, (len(data), -1)).mean(0)
         if mean.max() > best:
             best, (weight, state_weight) = mean.max(), grid[mean.argmax()]
@@ -188,14 +184,14 @@ def choose_detectors(taught: Learner, data: Sequence[SequenceFeatures], boundari
 
 
 def _shown(cells: np.ndarray) -> np.ndarray:
-    """Labelled edges, -1 for the boundaries of a skipped subtask (equal ones): not their own course."""
+    """Labelled edges, -1 for the (equal) boundaries of a skipped subtask, which show nothing of their own."""
     equal = np.diff(cells) == 0
     return np.where(np.r_[equal, False] | np.r_[False, equal], -1, cells)
 
 
-def _judged(crossing: np.ndarray, cells: np.ndarray) -> tuple[float, np.ndarray]:
-    """Mean log posterior probability that each boundary is within one cell of its label, and the squared
-    difference of each label from its posterior mean, less the variance [cells^2]."""
+def _held_out_score(crossing: np.ndarray, cells: np.ndarray) -> tuple[float, np.ndarray]:
+    """Mean log posterior probability that boundaries are within a cell of their labels, and by boundary the
+    squared deviation of the label from the posterior mean, in excess of the posterior variance [cells^2]."""
     index = np.arange(len(crossing))[:, None]
     near = (crossing * (np.abs(index - cells) <= 1)).sum(0)
     mean = (crossing * index).sum(0)
@@ -205,53 +201,51 @@ def _judged(crossing: np.ndarray, cells: np.ndarray) -> tuple[float, np.ndarray]
 
 def _fit_unlabelled(data: list[SequenceFeatures], task: SequenceTask, mapping: FeatureMap,
                     boundaries: list[np.ndarray]) -> SequenceModel:  # fmt: skip
-    """All courses of the trials with what their changes may be, given what few labels there are."""
+    """Courses of all trials and what their changes may be, given the few labels there are."""
     values, num_states = [each.values for each in data], len(task.sequence)
     if num_states == 1:
         learner = Learner(values, task.sequence, optional_states(task, False))
-        return _finish(
-            data, task, mapping, learner, *_settle(learner, [np.ones((len(v), 1)) for v in values])
-        )
+        start = [np.ones((len(v), 1)) for v in values]
+        return _finish(data, task, mapping, learner, *_converge(learner, start))
     factor = max(1, round(float(np.median([len(v) for v in values])) / COARSE_CELLS))
     known = [each.shares(b) for each, b in zip(data, boundaries, strict=True)]
-    courses = find_courses([coarse(v, factor) for v in values], num_states, known)
+    courses = find_courses([coarsen(v, factor) for v in values], num_states, known)
     namings = [naming(course, num_states, known) for course in courses]
     probability = probabilities(namings)
     choice = best_choice(courses, namings, probability)
     optional = optional_states(task, choice.settled)
-    allowed = [forbidden(d, b, len(optional)) for d, b in zip(data, boundaries, strict=True)]
+    allowed = [label_constraints(d, b, len(optional)) for d, b in zip(data, boundaries, strict=True)]
     learner = Learner(values, task.sequence, optional, allowed=allowed)
     paths = [np.searchsorted(np.array(choice.ends) - 0.5, p.argmax(1))
-             for p in _fine(courses[choice.course], factor, values)]  # fmt: skip
-    model = _finish(
-        data, task, mapping, learner, *_settle(learner, [np.eye(len(optional))[p] for p in paths])
-    )
+             for p in _on_fine_grid(courses[choice.course], factor, values)]  # fmt: skip
+    start = [np.eye(len(optional))[p] for p in paths]
+    model = _finish(data, task, mapping, learner, *_converge(learner, start))
     order = [i for i in np.argsort(-probability) if probability[i] >= LEAST_PROBABLE][:MOST_KEPT]
     total = float(probability[order].sum())
-    named = tuple(_named(values, known, courses[i], namings[i], float(probability[i]) / total, factor)
+    named = tuple(_name_course(values, known, courses[i], namings[i], float(probability[i]) / total, factor)
                   for i in order)  # fmt: skip
     scale = np.where(np.isfinite(boundaries).any(0), WEIGHING.labelled, WEIGHING.lag)
     lag = scale * float(np.median([len(v) for v in values]))
     return replace(model, courses=named, lag=lag, sure=choice.right)
 
 
-def _settle(learner: Learner, start: list[np.ndarray]) -> tuple[StudentEmissions, list[np.ndarray]]:
-    """EM at the finest scale, with the emissions' own share of independent observations in the end."""
+def _converge(learner: Learner, start: list[np.ndarray]) -> tuple[StudentEmissions, list[np.ndarray]]:
+    """EM at the finest scales, then posterior state probabilities under tempered emissions."""
     emissions, probability = learner.run(start, 1 / learner.stacked.shape[1], FLOORS[-2:])
     emissions = learner.tempered(emissions, probability)
     return emissions, [a.smoothed for a in learner.align(emissions, learner.law(probability))]
 
 
-def _fine(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndarray]:
-    """Probabilities [(num_cells, num_stretches), ...] of a course's stretches on the fine grid."""
+def _on_fine_grid(course: Course, factor: int, values: list[np.ndarray]) -> list[np.ndarray]:
+    """Probabilities [(num_cells, num_stretches), ...] of a course's stretches, on the fine grid."""
     return [np.repeat(p, factor, axis=0)[: len(v)] for p, v in zip(course.probability, values, strict=True)]
 
 
-def _named(values: list[np.ndarray], known: list[np.ndarray], course: Course, found: Naming,
+def _name_course(values: list[np.ndarray], known: list[np.ndarray], course: Course, found: Naming,
            probability: float, factor: int) -> NamedCourse:  # fmt: skip
-    """A course on the fine grid, and how far labels, as shares, say that boundaries lie off its changes."""
+    """A course on the fine grid, with the mean lag of labels (as shares) behind each of its changes."""
     names = [f"{k}" for k in range(len(course.cost) - 1)]
-    learner, stretches = Learner(values, names, [False] * len(names)), _fine(course, factor, values)
+    learner, stretches = Learner(values, names, [False] * len(names)), _on_fine_grid(course, factor, values)
     emissions = learner.tempered(learner.emissions(stretches, FLOORS[-1], 1.0), stretches)
     mean_cells = np.maximum(np.mean([p.sum(0) for p in stretches], 0), LEAST_CELLS)
     lags = np.array([(b[:, None] - ends) * len(v)
@@ -263,7 +257,7 @@ def _named(values: list[np.ndarray], known: list[np.ndarray], course: Course, fo
 
 def _fit_labelled(data: list[SequenceFeatures], task: SequenceTask, mapping: FeatureMap,
                   boundaries: list[np.ndarray]) -> SequenceModel:  # fmt: skip
-    """Labelled emissions place the other trials; then all of them teach together."""
+    """Emissions learned from fully labelled trials align the others; then EM over all of them."""
     whole = [bool(np.isfinite(b).all()) for b in boundaries]
     paths = [np.searchsorted(b, d.middle, side="right") if labelled else None
              for d, b, labelled in zip(data, boundaries, whole, strict=True)]  # fmt: skip
@@ -275,7 +269,7 @@ def _fit_labelled(data: list[SequenceFeatures], task: SequenceTask, mapping: Fea
     law = taught.law(probability)
     mine = [d for d, _, _ in own], [b for _, b, _ in own], [path for _, _, path in own]
     detectors = choose_detectors(taught, *mine, temper=emissions.temper, law=law)
-    allowed = [None if labelled else forbidden(d, b, len(optional))
+    allowed = [None if labelled else label_constraints(d, b, len(optional))
                for d, b, labelled in zip(data, boundaries, whole, strict=True)]  # fmt: skip
     learner = Learner([d.values for d in data], task.sequence, optional, known=paths, allowed=allowed)
     if len(own) < len(data):
@@ -288,7 +282,7 @@ def _fit_labelled(data: list[SequenceFeatures], task: SequenceTask, mapping: Fea
 def _finish(data: list[SequenceFeatures], task: SequenceTask, mapping: FeatureMap, learner: Learner,
             emissions: StudentEmissions, probability: list[np.ndarray],
             detectors: Detectors | None = None) -> SequenceModel:  # fmt: skip
-    """The model with what its own trials score, so that misfits can be recognised."""
+    """The model, with the usual misfit of its own trials for comparison."""
     mean_cells, presence = durations(probability)
     typical = np.median([p.sum(0) for p in probability], 0)
     settled = learner.num_states > len(task.sequence)

@@ -1,8 +1,8 @@
-"""What is learned of a plain ordered task, its file, and whether a trial follows it.
+"""The fitted model of a plain ordered task, its file, and the test whether a trial follows the task.
 
-Two scores of a trial are compared with those of the trials that the model was learned from: how much better
-free switching among the same states explains it than the forced order does, and how poorly even the forced
-order does per cell. Besides, a subtask squeezed to almost nothing did not happen.
+Two scores of a trial are compared with those of the training trials: the log evidence of switching freely
+among the same states over that of the forced order, and minus the log evidence of the forced order per cell.
+A subtask squeezed to almost nothing did not happen either.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
 from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
-from hmmseg.sequence.emissions import LEAST_CELLS, Detectors, StudentEmissions, transitions, weighed
+from hmmseg.sequence.emissions import LEAST_CELLS, Detectors, StudentEmissions, transitions, weigh
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures
 from hmmseg.tables import Tabled, listed
 
@@ -30,21 +30,20 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 FORMAT = "hmmseg.sequence-model/3"
-INDEPENDENT = 250.0  # chosen: independent observations that one trial's fit is judged by in the limit of many
-WIDTHS = 6.0  # chosen: a trial this many widths outside the others does not fit
+INDEPENDENT = 250.0  # chosen: independent observations to which the evidence of one trial is coarsened
+WIDTHS = 6.0  # chosen: a score that exceeds the usual by this many widths is a misfit
 LEAST_WIDTH = (2.0, 0.02)  # chosen: nats for the first score, nats per cell for the second
-FEW = 4.0  # chosen: trials; the usual width of scores is widened by one over their number, times this
-MEASURABLE = 20.0  # chosen: cells a subtask usually lasts, for two cells to be too few
-SQUEEZED = 0.03  # chosen: of the typical duration
+FEW = 4.0  # chosen: trials; the usual width of n trials is widened by the factor 1 + FEW / n
+MEASURABLE = 20.0  # chosen: cells; shorter subtasks are not tested for being squeezed
+SQUEEZED = 0.03  # chosen: share of the typical duration
 
 
 @dataclass(frozen=True)
 class NamedCourse:
-    """A way to align trials, by an ordered model of more stretches than states, and what its changes are.
+    """A course (`hmmseg.sequence.courses`) on the fine grid, and which of its changes are the boundaries.
 
-    `probability`: of the course; `naming` (num_boundaries, num_changes): that boundary b is change j of
-    it, which sums to 1 over j. `shift` (num_boundaries, num_changes) [cells]: by how much labels say that
-    boundary b comes after change j.
+    `probability`: of the course; `naming` (num_boundaries, num_changes): that boundary b is change j, summing
+    to 1 over j; `shift` (num_boundaries, num_changes) [cells]: mean lag of labelled boundaries behind it.
     """
 
     probability: float
@@ -54,7 +53,7 @@ class NamedCourse:
     shift: np.ndarray
 
     def align(self, trial: SequenceFeatures) -> AlignmentPosterior:
-        """Posterior alignment; InfeasibleAlignment for a trial with fewer cells than stretches."""
+        """Posterior alignment; InfeasibleAlignment for fewer cells than stretches."""
         count = len(self.mean_cells)
         law = transitions(self.mean_cells, np.ones(count), [False] * count)
         return align([self.emissions.log_likelihoods(trial.values)], [law])[0]
@@ -64,15 +63,17 @@ class NamedCourse:
 class SequenceModel(Tabled):
     """Emissions and durations of a plain ordered task, from `fit_sequence`.
 
-    There is one state a subtask and, where unlabelled trials show it, one more, `settled`: they run on after
-    the last event, and what then happens (decay, rest) belongs to the last subtask but looks
-    different. `mean_cells`, `presence` (num_states,): mean duration in cells and the probability
-    that an optional state occurs. `typical` (num_states,) is the median duration [cells] in the
-    trials learned from, `usual_scores` (2, 2) their median and width of the two scores of `misfit`.
-    Where not all labels of two trials were given, `courses` are the ways to align the
-    trials and to name their changes, and boundaries are as uncertain as all of them together; `lag`
-    (num_boundaries,) [cells] is how far they lie off such a change (the scale of a Laplace law), `sure`
-    (num_boundaries,) the probability that the boundaries of this model are the task's.
+    Unlabelled trials may show one more state than the task names, the `settled` one: recordings run on after
+    the last event, and what follows (decay, rest) belongs to the last subtask but looks different. Unless two
+    trials are fully labelled, the model keeps several `courses`, and boundaries are mixtures over them.
+
+    Attributes:
+        mean_cells, presence: (num_states,) mean duration [cells], and probability of an optional state.
+        typical: (num_states,) median duration [cells] in the training trials.
+        usual_scores: (2, 2) median and width of the two scores of `misfit` in the training trials.
+        courses: alternative alignments, most probable first.
+        lag: (num_boundaries,) [cells] scale of the Laplace law of boundaries about their change.
+        sure: (num_boundaries,) probability that the boundaries of this model are the task's.
     """
 
     task: SequenceTask
@@ -89,30 +90,29 @@ class SequenceModel(Tabled):
     sure: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def tables(self) -> list[Table]:
-        """Its states: how long they usually last, and how surely the model has their beginnings."""
-        surely, rows = ["", *(f"{p:.2f}" for p in self.sure)], []
+        """Its states: how long they usually last, and the probability that they begin where found."""
+        sure, rows = ["", *(f"{p:.2f}" for p in self.sure)], []
         for k, name in enumerate(self.task.sequence):
             there = f"{100 * self.presence[k]:.0f} %" if name in self.task.optional else "always"
             lasts = f"{self.typical[k] * self.mapping.step:.3g}"
-            rows.append((name, lasts, there, surely[k] if k < len(surely) else ""))
+            rows.append((name, lasts, there, sure[k] if k < len(sure) else ""))
         heads = ("state", "usually lasts [s]", "occurs", "begins here with probability")
         return [listed(f"a model of {', '.join(self.mapping.channels)}", heads, rows, wraps=True)]
 
     def align(self, trial: SequenceFeatures) -> AlignmentPosterior:
-        """Posterior alignment; InfeasibleAlignment for a trial with fewer cells than subtasks."""
+        """Posterior alignment; InfeasibleAlignment for fewer cells than subtasks."""
         law = transitions(self.mean_cells, self.presence, optional_states(self.task, self.settled))
-        ll, chain = weighed(trial.values, self.emissions, law, self.detectors)
+        ll, chain = weigh(trial.values, self.emissions, law, self.detectors)
         return align([ll], [chain])[0]
 
     def misfit(self, trial: SequenceFeatures) -> tuple[np.ndarray, np.ndarray, AlignmentPosterior]:
-        """How badly a trial fits.
+        """How badly a trial fits, without boundary templates, which free switching has no counterpart of.
 
-        Templates of boundaries have no counterpart in free switching and are left out; where no labels
-        taught the model, evidence is coarsened (hmmseg.sequence.courses).
+        Evidence of models learned without labels is coarsened (`hmmseg.sequence.courses`).
 
         Returns:
             (2,) log evidence of free switching over forced order [nats], and minus log evidence per cell;
-            the log-likelihoods (num_cells, num_states) and the alignment that they are of.
+            the log-likelihoods (num_cells, num_states); the alignment.
         """
         model, temper = replace(self, detectors=None), self.emissions.temper
         if self.detectors is None:
@@ -123,7 +123,7 @@ class SequenceModel(Tabled):
         return np.array([better, -alignment.log_evidence / len(ll)]), ll, alignment
 
     def _free(self, log_likelihoods: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Arguments of the ergodic model: same durations, any state next."""
+        """Arguments of the ergodic model: the same durations, and any state next."""
         num_states = log_likelihoods.shape[1]
         leave = 1 / np.maximum(self.mean_cells, LEAST_CELLS)
         transition = np.tile(np.log(leave / max(num_states - 1, 1))[:, None], (1, num_states))
@@ -133,7 +133,7 @@ class SequenceModel(Tabled):
     def failure(self, trial: SequenceFeatures) -> Failure | None:
         """The first subtask at which a trial leaves the task; None where it fits.
 
-        The first subtask may be cropped to any length, so it is never called squeezed.
+        The first subtask may be cropped to any length and is not tested for being squeezed.
         """
         names, optional = self.task.sequence, optional_states(self.task, settled=False)
         scores, ll, alignment = self.misfit(trial)
@@ -160,9 +160,9 @@ def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
 
 
 def usual_misfit(scores: Sequence[np.ndarray]) -> np.ndarray:
-    """(2, 2): median and width of each score [(2,), ...] over the trials learned from.
+    """Median and width (2, 2) of each score [(2,), ...] over the training trials.
 
-    The width of few trials is uncertain itself and widened by 1 + FEW / their number.
+    The width is widened by 1 + FEW / their number, as that of few trials is uncertain itself.
     """
     center = np.median(scores, axis=0)
     width = NORMAL * np.median(np.abs(np.array(scores) - center), axis=0)
@@ -170,7 +170,7 @@ def usual_misfit(scores: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _first_departure(path: np.ndarray, names: Sequence[str], optional: Sequence[bool]) -> tuple[int, str]:
-    """Where the freely switching path first breaks the order."""
+    """The subtask at which the freely switching path first breaks the order, and why."""
     at = -1
     for state in np.minimum(path[np.r_[True, np.diff(path) != 0]], len(names) - 1):
         missing = [k for k in range(at + 1, state) if not optional[k]]
@@ -184,7 +184,7 @@ def _first_departure(path: np.ndarray, names: Sequence[str], optional: Sequence[
 
 
 def save_model(model: SequenceModel, path: str | Path) -> None:
-    """Write a model to an NPZ file."""
+    """Write a model to an NPZ file, which `load_model` reads."""
 
     def parts(thing: Any, prefix: str = "") -> dict[str, Any]:
         table = dict(vars(thing))
@@ -210,7 +210,7 @@ def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
 
     Args:
         path: a file written by `save_model`.
-        task: for which it was learned.
+        task: the task for which it was learned.
 
     Returns:
         The model.
@@ -218,26 +218,26 @@ def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
     Raises:
         InputError: the file is no model, or was learned for another task.
     """
-    where = str(path)
+    where, expected = str(path), "a model written by `hmmseg fit`"
     try:
         table = unpack(Path(path))
         found = str(table.get("format", "no format"))
+        if found != FORMAT:
+            raise InputError(where, f"has format {found!r}", repr(FORMAT))
     except FileNotFoundError:
-        raise InputError(where, "no such file", "a model written by `hmmseg fit`") from None
+        raise InputError(where, "no such file", expected) from None
     except InputError:
         raise
-    except Exception:  # of what a damaged archive may raise there is no list: zipfile's, zlib's, NumPy's
-        raise InputError(where, "cannot be read", "a model written by `hmmseg fit`") from None
-    if found != FORMAT:
-        raise InputError(where, f"has format {found!r}", repr(FORMAT))
+    except Exception:  # damaged archives raise errors of zipfile, zlib, NumPy and others
+        raise InputError(where, "cannot be read", expected) from None
     try:
         return _model_of(table, task, where)
     except KeyError as error:
         raise InputError(where, f"lacks {error.args[0]}", "a complete model") from None
     except InputError:
         raise
-    except (TypeError, ValueError, OverflowError):  # the last of an infinite count
-        raise InputError(where, "holds values that no model has", "a model written by `hmmseg fit`") from None
+    except (TypeError, ValueError, OverflowError):  # OverflowError: an infinite count
+        raise InputError(where, "holds values that no model has", expected) from None
 
 
 def _model_of(table: dict[str, np.ndarray], task: SequenceTask, where: str) -> SequenceModel:

@@ -1,14 +1,13 @@
 """Segment trials of a plain ordered task: spans with boundary medians, deviations and intervals.
 
-Where trials can be aligned and read in several ways, every course gives each of its changes a posterior;
-together, weighted by the probabilities of the courses and that the boundary is that change, they are what is
-known of where a boundary lies, and of which label would decide.
+Where trials can be aligned and read in several ways, the posterior of a boundary is the mixture over courses
+and their changes, weighted by the probabilities of the courses and that the boundary is that change. It also
+shows which label would tell most.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -26,26 +25,19 @@ from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states
 
 LISTED = 0.05  # chosen: least probability of a place that is listed
-SURE = 1 - LISTED  # from here on one place is the answer: no other can be listed
+SURE = 1 - LISTED  # probability from which one place is the answer, as no other can be listed
 FARTHEST = 8.0  # numerics: reach of a Laplace law, in its scales
-LEAST = 1e-3  # numerics: probability of a naming that makes no difference
-EXACT = 1e-6  # numerics: of a feature's spread: what is nearer to a level than that is at it
+LEAST = 1e-3  # numerics: probability of a naming below which it is neglected
+EXACT = 1e-6  # numerics: least noise of a level, as a share of a feature's spread
 
 
-@dataclass(frozen=True)
-class Boundaries:
-    """`crossing` (num_cells - 1, num_boundaries): probability that each is at each edge; `gain`
-    (num_boundaries,) [nats]: the expected reduction of entropy, of what is which change, by its label."""
+def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse],
+        lag: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Mixture over all courses of `crossings` [(num_cells - 1, num_changes), ...], the posterior of each.
 
-    crossing: np.ndarray
-    gain: np.ndarray
-
-
-def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], lag: np.ndarray) -> Boundaries:
-    """Posterior over all courses, from `crossings` [(num_cells - 1, num_changes), ...] of each.
-
-    `lag` (num_boundaries,) [cells]. The gain is the mutual information of naming and label: what the
-    entropy of the mixture exceeds that of its parts by.
+    `lag` (num_boundaries,) [cells]. Returns the posterior (num_cells - 1, num_boundaries) of each boundary
+    at each cell edge, and the expected gain (num_boundaries,) [nats] of a label: the mutual information of
+    naming and label, which is the entropy of the mixture less the mean entropy of its components.
     """
     from scipy.ndimage import convolve1d, shift  # slow to import
 
@@ -68,14 +60,14 @@ def together(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse], la
         mixed = p @ table
         gain.append(max(float(entr(mixed).sum() - p @ entr(table).sum(1)), 0.0))
         mixture.append((1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / len(mixed))
-    return Boundaries(np.array(mixture).T, np.array(gain))
+    return np.array(mixture).T, np.array(gain)
 
 
 def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
-    """Places [s] of one boundary, most probable first; none where one of them is sure.
+    """Places [s] of one boundary, most probable first; none where one of them is SURE.
 
-    `edges` (num_cells + 1,) [s], `crossing` (num_cells - 1,) the boundary's probability at the inner ones,
-    `answer` [s] the time that is given: the first place. A place is what lies within NEAR of the trial.
+    `edges` (num_cells + 1,) [s]; `crossing` (num_cells - 1,): the boundary's probability at the inner ones;
+    `answer` [s]: the reported time, the first place. A place extends NEAR of the trial to either side.
     """
     inner, left = edges[1:-1], crossing / crossing.sum()
     reach = NEAR * (edges[-1] - edges[0])
@@ -99,7 +91,7 @@ def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Plac
     return tuple(place for place in found if place.probability >= LISTED)
 
 
-MAIN = 0.5  # chosen: least probability about a median for it to be the answer, not a time amid several places
+MAIN = 0.5  # chosen: least probability near a median for it to be reported, rather than lie between places
 
 _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interval
 
@@ -111,7 +103,7 @@ def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
     Args:
         trials: recordings.
         task: the order of the subtasks.
-        model: learned by `fit_sequence`; without one, it is learned from these trials themselves.
+        model: from `fit_sequence`; by default learned from these trials themselves.
 
     Returns:
         One segmentation a trial. A trial that does not follow the task says so in `failed` and keeps its
@@ -133,42 +125,43 @@ def _segment(trial: Trial, data: SequenceFeatures, model: SequenceModel) -> Segm
     names = model.task.sequence
     try:
         alignment = model.align(data)
-        known = _posterior(data, model, alignment)
+        crossing, gain = _posterior(data, model, alignment)
     except InfeasibleAlignment as error:
         k = min(error.subtask, len(names) - 1)
         failed = Failure(k, names[k], None, f"has no samples left: {error.reason}")
         return Segmentation(trial.file, trial.rate, float("-inf"), (), failed, recorded=trial)
-    spans = _spans(trial, data, model, alignment, known)
+    spans = _spans(trial, data, model, alignment, crossing)
     question = None
     if any(span.alternatives for span in spans):
-        question = Question(trial.file, names[int(known.gain.argmax()) + 1], float(known.gain.max()))
+        question = Question(trial.file, names[int(gain.argmax()) + 1], float(gain.max()))
     return Segmentation(trial.file, trial.rate, alignment.log_evidence, spans, model.failure(data),
                         recorded=trial, question=question)  # fmt: skip
 
 
-def _posterior(data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior) -> Boundaries:
-    """Of all boundaries: from the model itself where labels taught it, else from all its courses."""
+def _posterior(data: SequenceFeatures, model: SequenceModel,
+               alignment: AlignmentPosterior) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """As from `mix`, from the model's courses where it has any, else from its own alignment."""
     if model.courses:
-        return together([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
+        return mix([course.align(data).moves[0] for course in model.courses], model.courses, model.lag)
     crossing = alignment.boundary[:, : len(model.task.sequence) - 1].copy()
     if model.detectors is not None:
         for b in np.flatnonzero(model.detectors.jitter > 0):
             crossing[:, b] = gaussian_filter1d(crossing[:, b], model.detectors.jitter[b], mode="constant")
-    return Boundaries(crossing, np.zeros(crossing.shape[1]))
+    return crossing, np.zeros(crossing.shape[1])
 
 
 def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment: AlignmentPosterior,
-           known: Boundaries) -> tuple[Span, ...]:  # fmt: skip
-    """Spans where the model itself has them, as uncertain as all courses together."""
+           posterior: np.ndarray) -> tuple[Span, ...]:  # fmt: skip
+    """Spans at the model's own boundaries, with the uncertainty of the mixture over courses."""
     names, optional = model.task.sequence, optional_states(model.task, False)
-    visited = alignment.smoothed[0].copy()  # probability that a path starts in or enters each state
+    visited = alignment.smoothed[0].copy()  # probability that a path visits each state
     for d, band in enumerate(alignment.moves, 1):
         visited[d:] += band.sum(0)
     kept = [k for k in range(len(names)) if not optional[k] or visited[k] >= 0.5]
     first, last, step = float(trial.t[0]), float(trial.t[-1]), float(data.edges[1] - data.edges[0])
     found, dated = [], []
     for k in kept[1:]:
-        crossing, scattered = known.crossing[:, k - 1], bool(model.courses)
+        crossing, scattered = posterior[:, k - 1], bool(model.courses)
         found.append(_boundary(data.edges, crossing, first, last, scattered))
         dated.append(found[-1][0])
         if scattered:
@@ -180,10 +173,10 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
     starts: list[_Boundary] = [(first, 0.0, (first, first))]
     elsewhere: list[tuple[Place, ...]] = [()]
     for number, (k, median, (_, sd, (low, high))) in enumerate(zip(kept[1:], dated, found, strict=True), 1):
-        # A state that is there lasts a cell at least, as in every alignment: medians of places need not.
+        # As in every alignment, a state that occurs lasts at least a cell; medians alone do not ensure that.
         median = max(starts[-1][0] + step, min(median, last - step * (len(kept) - number)))
         starts.append((median, sd, (min(low, median), max(high, median))))
-        elsewhere.append(places(data.edges, known.crossing[:, k - 1], median) if model.courses else ())
+        elsewhere.append(places(data.edges, posterior[:, k - 1], median) if model.courses else ())
     ends = [*starts[1:], (last, 0.0, (last, last))]
     return tuple(
         Span(names[k], None, names[k], start[0], end[0], start[1], end[1], start[2], end[2], others)
@@ -192,11 +185,11 @@ def _spans(trial: Trial, data: SequenceFeatures, model: SequenceModel, alignment
 
 
 def _jumps(trial: Trial, data: SequenceFeatures, model: SequenceModel, times: list[float]) -> list[float]:
-    """When [s] the channels jump near the changes `times` that the features give.
+    """When [s] the channels jump near the changes `times` of the features.
 
-    Each is off the features' by the law of `Weighing.lag`, NEAR at most, and between them, as far as that
-    reaches, levels are constant with normal noise: all together on the cells, as changes that are near each
-    other share what they see, then each by itself between two samples.
+    The offset from a feature's change follows the Laplace law of `Weighing.lag`, NEAR at most; between jumps
+    levels are constant with normal noise. All jumps are found jointly on the cells, as neighbours share
+    samples, and each is then refined between two samples.
     """
     step, cells = model.mapping.step, len(data.values)
     farthest = max(round(NEAR * cells), 1)
@@ -215,15 +208,15 @@ def _jumps(trial: Trial, data: SequenceFeatures, model: SequenceModel, times: li
 
 
 def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: SequenceModel) -> np.ndarray:
-    """The cells, each within `farthest` of one of `at`, in which the level of `x` likeliest changes.
+    """The cells, each within `farthest` of its start in `at`, in which the level of `x` most likely changes.
 
-    `x` (num_cells, num_channels). A cell in which it changes is of neither level.
+    `x` (num_cells, num_channels). A cell in which the level changes counts for neither side.
     """
     there, x = _about_mean(x)
     sums = [np.concatenate([np.zeros((1, x.shape[1])), v.cumsum(axis=0)]) for v in (there, x, x**2)]
 
     def rest(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Squares that a level leaves from cell low + 1 up to high."""
+        """Residual sums of squares about the level of the cells from low + 1 up to high."""
         count, first, second = (v[high] - v[np.minimum(low + 1, high)] for v in sums)
         return second - first**2 / np.maximum(count, 1)
 
@@ -231,7 +224,7 @@ def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: Seq
     if not all(each.size for each in every):
         return at
     found = at
-    for _ in range(2):  # noise is what the changes of before leave
+    for _ in range(2):  # the noise is estimated from the previous changes
         ends = np.r_[-1, found, len(x)]
         noise = rest(ends[:-1], ends[1:]).sum(axis=0) / np.maximum(sums[0][-1], 1) + EXACT**2
         weight = model.emissions.temper / (2 * noise)
@@ -243,7 +236,7 @@ def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: Seq
                 source.append(cost.argmin(axis=0))
                 total = cost.min(axis=0)
             total = total + np.abs(each - at[b]) / lag
-        if not np.isfinite(total).any():  # no room for all states
+        if not np.isfinite(total).any():  # too few cells for all states
             return at
         path = [int((total + rest(every[-1], np.full_like(every[-1], len(x))) @ weight).argmin())]
         for back in reversed(source):
@@ -253,14 +246,14 @@ def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: Seq
 
 
 def _about_mean(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where values (n, k) are, and they about their means by column; 0 where they are missing."""
+    """Which values (n, k) are there, and the values about their column means, 0 where missing."""
     there = np.isfinite(x)
     x = np.where(there, x, 0.0)
     return there, np.where(there, x - x.sum(axis=0) / np.maximum(there.sum(axis=0), 1), 0.0)
 
 
 def _jump(trial: Trial, model: SequenceModel, before: float, time: float, after: float) -> float:
-    """The jump [s] within a cell of `time`, anywhere between two samples: the median."""
+    """Posterior median of the jump [s] within 1.5 cells of `time`, between any two samples."""
     step = model.mapping.step
     reach = model.mapping.window * step
     inside = slice(*np.searchsorted(trial.t, [max(before, time - reach), min(after, time + reach)]))
@@ -285,10 +278,9 @@ def _boundary(
 ) -> _Boundary:
     """Median, standard deviation and 90 % interval of a boundary [s].
 
-    `probability` (num_cells - 1,) lies on the inner edges; each is spread evenly over one cell's
-    width, as nothing is known within a cell. What is missing to 1 (a skipped subtask's boundary
-    at the very start) lies at the first edge. `scattered`: it may lie in places far apart, between which
-    there is nothing; the interval is then the shortest instead of that of equal tails.
+    `probability` (num_cells - 1,) of the inner edges is spread evenly over one cell's width, and what is
+    missing to 1 (a skipped subtask's boundary at the very start) lies at the first edge. Where the boundary
+    may lie in places far apart (`scattered`), the interval is the shortest, not that of equal tails.
     """
     middle, inner = (edges[1:] + edges[:-1]) / 2, edges[1:-1]
     cumulative = np.r_[0.0, np.cumsum(probability)]
@@ -303,7 +295,7 @@ def _boundary(
 
 
 def _shortest(middle: np.ndarray, cumulative: np.ndarray) -> tuple[float, float]:
-    """The shortest interval between two of the times `middle` that holds 90 % of what is `cumulative`."""
+    """The shortest interval between two of the times `middle` that holds 90 % of the probability."""
     stop = np.searchsorted(cumulative, cumulative + 0.9)
     start = np.flatnonzero(stop < middle.size)
     shortest = start[np.argmin(middle[stop[start]] - middle[start])]

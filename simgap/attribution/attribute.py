@@ -31,6 +31,7 @@ from simgap.attribution.verdict import (
     acting,
     conclude,
     known,
+    probabilities,
     shares,
     significant,
 )
@@ -190,10 +191,11 @@ def attribute(
     if gap.tolerance is not None and (found.p_value < ALARM or forced):
         small = _small(f, models, by_group, absorbed)
     if small is not None and gap.usual:  # a cause that is surely found can be mended
-        chance = conclude(sets, found.p_value).probabilities
+        chance = probabilities(sets, found.p_value)
         small = small if chance["none"] + chance["unknown"] > DOUBT else None
     first = next(iter(examined), ())
-    verdict = conclude(sets, found.p_value, small is None, _names(f, first) if forced else ())
+    named = _names(f, first) if forced else ()
+    verdict = conclude(sets, found.p_value, small is None, named, unseen=found.unseen)
     causes = next((j.causes for j in examined.values() if _names(f, j.causes) == verdict.causes), ())
     causes = first if forced else causes
     model = fitted(f, causes)
@@ -301,16 +303,25 @@ def _examined(
 
 
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
-    """Those causes without which trials that took no part are predicted worse, the one that says most left
-    out, taken out one by one: an accident of one trial is no cause."""
+    """Causes without which held-out trials are predicted worse, the others removed one at a time.
+
+    The trial that gains most does not count: an accident of one trial is no cause. An effect that only
+    scatters must gain more than form errors of the rest may feign.
+    """
+    of = others.whole.gap.candidates
     while causes:
-        rest = {j: [i for i in causes if i != j] for j in causes}
-        gains = {j: others.gains(causes, rest[j], rest[j]) for j in causes}
-        borne = {j: float(g.sum() - g[:-1].max()) for j, g in gains.items()}
-        least = min(borne, key=lambda j: borne[j])
-        if borne[least] > POSITIVE:
+        gained = {}
+        for j in causes:
+            rest = [i for i in causes if i != j]
+            gains = others.gains(causes, rest, rest)
+            gained[j] = float(gains.sum() - gains[:-1].max())
+            if rest and not of[j].parameters:
+                feigned = max(of[i].form for i in rest) * others.gain(rest, ())
+                gained[j] -= feigned if gains.sum() < feigned else 0.0
+        least = min(gained, key=lambda j: gained[j])
+        if gained[least] > POSITIVE:
             break
-        causes = tuple(rest[least])
+        causes = tuple(i for i in causes if i != least)
     return causes
 
 

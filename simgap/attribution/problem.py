@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.fft import dct
 
+MODELLED = 0.1  # prior: share by which the form of a modelled effect is off from part to part
 BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the bands that are distinguished
 
 
@@ -79,7 +80,7 @@ class Candidate:
     high: Float[np.ndarray, " k"]
     variance: Float[np.ndarray, " n"] | None = None
     evidence: float = 0.0
-    form: float = 0.1
+    form: float = MODELLED
     hidden: tuple[str, ...] = ()
     size: Float[np.ndarray, " k"] | None = None
     frees: np.ndarray | None = None

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import expit
 
 from simgap.attribution.posterior import (
     Background,
@@ -105,6 +106,11 @@ class Detection:
     statistic: float
     p_value: float
     resolution: float
+
+    @property
+    def unseen(self) -> float:
+        """Probability of a gap where it raises no alarm: by its Bayes factor, with even odds beforehand."""
+        return float(expit(min(self.statistic, 0.0)))
 
 
 def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ...] = ()) -> float:

@@ -1,8 +1,8 @@
-"""What may happen to one channel of a table with times: to what is read of it, or to what is commanded.
+"""Effects on one channel of a table with times: on its readings, or on its commands.
 
-A `ChannelEffect` in a module of this package is found by itself. It is then a candidate in a hand's forces
-(`hmmseg effects`, `play`, the virtual model), in every read-out or command of a robot, and in every
-channel of given simulated trials.
+Each `ChannelEffect` defined in a module of this package is found automatically. It is then a candidate in a
+hand's forces (`hmmseg effects`, `play`, the virtual model), in every read-out or command of a robot, and in
+every channel of given simulated trials.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from simgap.effect import Array, Effect, Parameter
 
 Theta = Mapping[str, float]  # an effect's parameters by name
 Act = Callable[[Array, Array, Theta], Array]  # (times since the start [s], values there, theta)
-SHORTEST = 1e-9  # numerics: s: below this nothing is smoothed
-SETTLED = 5  # numerics: samples before a start that tell `onset` of rest
+SHORTEST = 1e-9  # numerics: s; a shorter time constant smooths nothing
+SETTLED = 5  # numerics: samples of rest put before a start, for `onset`
 
 
 @dataclass(frozen=True)
 class ChannelEffect(Effect):
-    """An effect on one channel: `read` gives what is recorded of true values, or what acts of commanded ones.
+    """An effect on one channel: `read` maps true values to recorded ones, or commanded values to acting ones.
 
-    `read` and `undo` map values (num_timesteps,) at times (num_timesteps,), there and back; NumPy and JAX
-    arrays alike, unless it `remembers` other times than a sample's own. A parameter's unit may be "" for the
-    channel's own, or "/s" for that in a second; its numbers are then shares of what is usual in the channel.
-    `of`: of what it is a candidate: "reading", "effort" (a command of torque, force or current), "duty" (one
-    without a unit), "place" (of a position).
+    `read` and its inverse `undo` map values (num_timesteps,) at times (num_timesteps,), for NumPy and JAX
+    arrays unless the effect `remembers` other samples. A parameter's unit may be "" (the channel's own) or
+    "/s" (that per second); its numbers are then relative to the channel's usual size. `of` lists what it is a
+    candidate for: "reading", "effort" (commands of torque, force or current), "duty" (commands without a
+    unit), "place" (commands of a position).
     """
 
     read: Act = lambda t, values, theta: values
@@ -40,8 +40,8 @@ class ChannelEffect(Effect):
     remembers: bool = False
 
     def sized(self, size: float, unit: str, duration: float, factor: float = 1.0) -> dict[str, Parameter]:
-        """Parameters in a channel's unit: `size` is its usual one, `duration` [s] that of its log; priors
-        wider by `factor`."""
+        """Parameters in a channel's `unit`, given its usual `size` and the `duration` [s] of its log; prior
+        standard deviations are multiplied by `factor`."""
         out = dict[str, Parameter]()
         for name, p in self.parameters.items():
             own = {"": size, "/s": size / duration}.get(p.unit)
@@ -52,14 +52,14 @@ class ChannelEffect(Effect):
 
 @cache
 def channel_effects(*of: str) -> dict[str, ChannelEffect]:
-    """Effects on readings (or what else is named) by name, in the order in which they are defined."""
+    """Effects on readings (or on any of the kinds `of`) by name, in the order of their definition."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     found = [v for m in modules for v in vars(m).values() if isinstance(v, ChannelEffect)]
     return {e.name: e for e in found if {*e.of} & {*(of or ("reading",))}}
 
 
 def at_rest(read: Act, t: np.ndarray, values: np.ndarray, theta: Theta) -> np.ndarray:
-    """What is read of values (n,) that had rested before the first of the times."""
+    """`read` of values (n,) that were constant before the first time."""
     if len(t) < 2:
         return read(t, values, theta)
     early = t[0] - (t[1] - t[0]) * np.arange(SETTLED, 0, -1)
@@ -68,7 +68,7 @@ def at_rest(read: Act, t: np.ndarray, values: np.ndarray, theta: Theta) -> np.nd
 
 
 def delayed(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
-    """Values (num_timesteps,) `delay` [s] later, at these times; before their start they were a parabola."""
+    """Values (num_timesteps,) delayed by `delay` [s]; before the start they are a parabola."""
     if len(values) < 3:
         return values
     late = t - delay
@@ -79,7 +79,7 @@ def delayed(t: np.ndarray, values: np.ndarray, delay: float) -> np.ndarray:
 
 
 def onset(t: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """First and second derivative at the start, of the parabola through three early samples."""
+    """First and second derivative at the start of the parabola through three early samples."""
     few = min(2, (len(values) - 1) // 2)
     a, b = t[few] - t[0], t[2 * few] - t[0]
     first, second = (values[few] - values[0]) / a, (values[2 * few] - values[0]) / b
@@ -88,9 +88,9 @@ def onset(t: np.ndarray, values: np.ndarray) -> tuple[float, float]:
 
 
 def lowpass(t: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarray:
-    """tau y' + y = u for values u (num_timesteps,) linear between samples, exactly.
+    """Exact solution of tau y' + y = u for values u (num_timesteps,) that are linear between samples.
 
-    Before the start u was a parabola, which y had settled to follow: y = u - tau u' + tau^2 u''.
+    Before the start u is a parabola that y follows in steady state: y = u - tau u' + tau^2 u''.
     """
     if time_constant < SHORTEST or len(values) < 3:
         return values
@@ -102,7 +102,7 @@ def lowpass(t: np.ndarray, values: np.ndarray, time_constant: float) -> np.ndarr
 
 
 def play(values: np.ndarray, width: float) -> np.ndarray:
-    """The play operator: the output (n,) follows the input only where that pushes a side of the gap."""
+    """The play operator: the output (n,) follows the input only while it pushes a side of the gap."""
     from simgap.recursions import play
 
     return play(values, width)

@@ -1,4 +1,4 @@
-"""What drives make of a command: scaled, offset, clipped, faded, through a dead band or play."""
+"""Effects of drives on a command: gain, offset, saturation, fading, dead band and backlash."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from simgap.channels import ChannelEffect, play, sensors
 from simgap.effect import Parameter
 
-DRIVES = ("effort", "duty")  # commands that are 0 where nothing is to be done
+DRIVES = ("effort", "duty")  # commands with a natural zero
 EVERY = (*DRIVES, "place")
-LARGEST = "largest"  # of `theta`: the largest absolute value that was commanded
+LARGEST = "largest"  # key of `theta`: the largest absolute value commanded
 
 BACKLASH = ChannelEffect(
     name="backlash",

@@ -1,4 +1,4 @@
-"""What sensors make of a channel: a zero error, a drift, a gain, a lag, a low-pass."""
+"""Effects of sensors on a channel: bias, drift, gain, lag and low-pass."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ LAG = ChannelEffect(
     shows="every change of the course, late",
     called="a reading that comes late",
     check="Compare time stamps of two channels at a sharp event.",
-    # A stamp that is late makes the delay negative.
+    # Late time stamps make the delay negative.
     parameters={"delay": Parameter(0.0, 0.01, "s", low=-0.2, high=0.5, starts=(0.03, 0.1, 0.3))},
     read=lambda t, values, theta: delayed(t, values, theta["delay"]),
     undo=lambda t, values, theta: np.interp(t + theta["delay"], t, values),

@@ -1,4 +1,4 @@
-"""The candidate effects: every `Effect` that a module of this package defines is one, found by itself."""
+"""The candidate effects: each `HandEffect` defined in a module of this package, found automatically."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def catalogue() -> dict[str, HandEffect]:
     """All effects by name, in alphabetical order."""
     modules = [importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__)]
     effects = {e.name: e for each in modules for e in vars(each).values() if isinstance(e, HandEffect)}
-    # Those on any channel, but where hands have forms of their own.
+    # Effects on any channel act on forces, except where hands have effects of that name.
     on_forces = (of_forces(channel) for channel in channel_effects().values())
     effects = {e.name: e for e in on_forces if e.correct or e.name in effects} | effects
     return dict(sorted(effects.items()))
@@ -31,12 +31,12 @@ def effect_named(name: str) -> HandEffect:
 
 
 def name_of(key: str) -> str:
-    """The effect that a key means: its name, or name/1, name/2, .. for its other forms."""
+    """Name of the effect that a key stands for: NAME, or NAME/1, NAME/2, ... for its other forms."""
     return key.split("/")[0]
 
 
 def free_parameters(key: str) -> tuple[str, ...]:
-    """Parameters that are free in a form of an effect."""
+    """Free parameters of a form of an effect."""
     effect, _, form = catalogue()[name_of(key)], *key.partition("/")[1:]
     return effect.forms[int(form or 0)] if effect.forms else tuple(effect.parameters)
 

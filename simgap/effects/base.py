@@ -1,8 +1,8 @@
-"""What an effect is: one unmodelled mechanism, its parameters, and how it acts on what is recorded.
+"""What an effect on a hand is: an unmodelled mechanism, its parameters, and how it changes what is recorded.
 
-The diagnosis never simulates with an effect. It takes the recording back to what the nominal hand
-would have shown (`correct`), and asks whether the contact equations then hold. The simulator's
-truth is taken forward (`apply`, `scene`) to make recordings with a known effect.
+The diagnosis never simulates with an effect. It corrects the recording to what the nominal hand would have
+shown (`correct`) and tests whether the contact equations then hold. Recordings with a known effect are made
+by applying it to simulated truth (`apply`, `scene`).
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import tomlkit
+from tomlkit.items import Table
 
 from hmmseg.hand.kinematics import turning
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -22,10 +24,10 @@ Values = dict[str, float]  # parameter name -> its value
 
 
 class DeadBand(NamedTuple):
-    """Where joints lie in their dead bands: `place` (T, N, 4) [rad] as expected, certain where `pinned`.
+    """Positions of joints within their dead bands: expected `place` (T, N, 4) [rad], certain where `pinned`.
 
-    Elsewhere a joint goes on from one sample to the next by `drift` (T, N, 4) [rad], with variance `wander`
-    (T, N, 4), or anywhere in its band, with variance `jump` (T, 4) [rad^2].
+    Elsewhere a joint moves from one sample to the next by `drift` (T, N, 4) [rad] with variance `wander` (T,
+    N, 4), or anywhere in its band with variance `jump` (T, 4) [rad^2].
     """
 
     place: Array
@@ -38,24 +40,28 @@ class DeadBand(NamedTuple):
 class World(NamedTuple):
     """Aligned trials and the constants of the hand, as far as an effect may change them.
 
-    T trials, N samples, M moves. `joints`, `rates`, `force` (T, N, 4): link angles and their rates
-    (tip positions and velocities of a Cartesian hand), forces fx1, fy1, fx2, fy2. `load` (T, N, 4) [N]: what
-    of them acts between the contact and the sensor, in time with the contact. `link` (4,)
-    relative lengths; `give_normal`, `give_shear` (2,) [m/N]: the pads' compliances.
-    `delay`, `smoothing` (4,) [s]: of the force channels. `creep`, `creep_time` [s]: share and time of
-    the pads' delayed part. `tilt` [rad], `give_support` [m/N] and `support_time` [s] of the support, which
-    yields with that delay (spring and damper in parallel). `inertia`: factor of the mass times acceleration.
-    `couple` [m]: how far the mass lies right of the middle. `hang` [rad]: by how much a block in the air has
-    turned clockwise against how it stood.
-    `loudness` (T, N, 4): recorded noise over the noise of corrected forces, of net fx, net fy, grip, shear.
-    `ring` (3,): frequency [Hz], damping and drive of a mode that every change of load rings.
-    `off` [m] (T, N, 4): by how much x, y, distance and offset are off besides.
-    `dead_band`: what is known of where joints lie in theirs, None where they have none.
-    `slip` (T, N): whether (0 to 1) pads slide on the block; `modes` (6,): 1 where a candidate delays or
-    smooths forces, lets pads creep or slide, a mode ring or the support yield (LATE, SMOOTH, CREEPING,
-    SLIDING, RINGING, YIELDING), so that equations without it are not evaluated.
-    `free`, `ground`, `carry` (T, N): which state each sample is in (1 or 0); `events` (T, 4 M) [s]:
-    touch, leave, meet, part of every move.
+    T trials, N samples, M moves.
+
+    Signals: `joints`, `rates` (T, N, 4), link angles and their rates (tip positions and velocities of a
+    Cartesian hand); `force` (T, N, 4), fx1, fy1, fx2, fy2 [N]; `load` (T, N, 4) [N], the part of it that acts
+    between contact and sensor, synchronous with the contact; `off` (T, N, 4) [m], additional offsets of x, y,
+    distance and offset; `loudness` (T, N, 4), recorded noise over the noise of corrected forces, for net fx,
+    net fy, grip and shear.
+
+    Hand: `link` (4,), relative lengths; `give_normal`, `give_shear` (2,) [m/N], compliances of the pads;
+    `creep`, `creep_time` [s], share and time constant of their delayed part; `delay`, `smoothing` (4,) [s] of
+    the force channels; `ring` (3,), frequency [Hz], damping and drive of a mode excited by every change of
+    load; `dead_band`, None if joints have none.
+
+    Blocks and support: `tilt` [rad], `give_support` [m/N] and the delay `support_time` [s] with which the
+    support yields (spring and damper in parallel); `inertia`, factor of mass times acceleration; `couple`
+    [m], distance of the mass to the right of the middle; `hang` [rad], clockwise rotation of a lifted block
+    against how it stood.
+
+    State: `free`, `ground`, `carry` (T, N), 1 where the sample is in that state; `slip` (T, N), whether pads
+    slide (0 to 1); `events` (T, 4 M) [s], touch, leave, meet and part of every move; `modes` (6,), 1 where a
+    candidate delays or smooths forces, lets pads creep or slide, a mode ring or the support yield (LATE,
+    SMOOTH, CREEPING, SLIDING, RINGING, YIELDING), so that equations without it are not evaluated.
     """
 
     t: Array
@@ -96,9 +102,8 @@ LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
 
 
 class Performance(NamedTuple):
-    """A simulated truth that effects act on: n fine times `t` [s], tips' `position`, `velocity` and
-    `force` (n, 2 fingers, 2 axes) as the sensors will have them, `events` [s] and carried `blocks`.
-    """
+    """A simulated truth for effects to act on: n fine times `t` [s], the tips' `position`, `velocity` and
+    `force` (n, 2 fingers, 2 axes) as the sensors will see them, and `events` [s]."""
 
     t: np.ndarray
     position: np.ndarray
@@ -106,8 +111,8 @@ class Performance(NamedTuple):
     force: np.ndarray
     events: np.ndarray
     rig: Rig
-    carried: np.ndarray  # (n,) weight [N] of the block in the air, else 0
-    width: np.ndarray  # (n,) width [m] of the block in the air, else 1
+    carried: np.ndarray  # (n,) weight [N] of the lifted block, else 0
+    width: np.ndarray  # (n,) width [m] of the lifted block, else 1
 
 
 Correct = Callable[[World, Values, Array], World]
@@ -116,28 +121,32 @@ Apply = Callable[[Performance, Values, np.random.Generator], Performance]
 
 @dataclass(frozen=True)
 class HandEffect(Effect):
-    """One mechanism of a hand that moves blocks. `acts_on`: "sensing", "kinematics", "contact", "dynamics",
-    "motion" or "measurement"; `stage` orders corrections: what is nearest to the recorded number comes first.
+    """A mechanism of a hand that moves blocks.
 
-    `correct(world, values, on)` takes the recording back; `on` is 1 where the effect is in the
-    candidate and 0 elsewhere, for parameters that have no neutral value. `scatter(problem, residual)`
-    gives the variance of a random disturbance instead (a `simgap.gap.assemble.Scatter`).
-    `apply(performance, values, rng)` takes a simulated truth forward; `scene(values)` changes the
-    scene before it is simulated; `finish(force, values)` acts on the recorded forces, noise and all.
-    `chosen` is false for effects that only `--effect` asks for. `report(values, rig)` gives the parameters
-    as the interface names them. `forms`: sets of parameters of which one is free and the others neutral, the
-    usual one first; all are free where none is listed. `admitted(rig)`: key of a form, and standard
-    deviations by parameter, as rig.toml has them under [systematic]. `wrist`: its first form shows in a
-    sensor in the wrist. `played`: values at which it is felt in a played world where none are given,
-    by default from its priors; empty for one that cannot be felt. `turns`: the parameter
-    [rad] by up to which blocks turn in the grip on the ground where it acts, as they please.
+    `acts_on` is "sensing", "kinematics", "contact", "dynamics", "motion" or "measurement". `stage` orders
+    corrections: what is nearest to the recorded number comes first.
 
-    `phrase(means, rig)`: the effect in plain words where its parameters decide them.
-    `sampled(t, values, rng)`: when samples are taken that are stamped t. `grip` [N]: least and most that
-    blocks are held with, so that it shows. `restored(channels, values)`: recorded channels as they would be
-    without it. `patched(document, found)`: puts what was found into numbers that rig.toml has of its own, and
-    says where each parameter is found; None where it has none. `wrong(problem, push)`: candidates of the gap
-    that stand for measurements rather than for what acts.
+    Its action: `correct(world, values, on)` corrects a recording; `on` is 1 if the effect is in the
+    candidate, else 0, for parameters without a neutral value. `scatter(problem, residual)` gives the variance
+    of a random disturbance instead (a `simgap.gap.assemble.Scatter`). `apply(performance, values, rng)`
+    applies it to simulated truth, `scene(values)` changes the scene before simulation, `sampled(t, values,
+    rng)` gives the true times of samples stamped t, and `finish(force, values)` acts on recorded forces
+    including noise. `restored(channels, values)` removes the effect from recorded channels.
+
+    Its forms: in each of `forms` the listed parameters are free and the others neutral, the usual form first;
+    by default all are free. `admitted(rig)` is the key of a form with standard deviations by parameter, as
+    stated in rig.toml under [systematic]. `wrong(problem, push)` gives candidates that stand for wrong
+    measurements.
+
+    Where it is used: `chosen` is false for effects that only `--effect` requests. `wrist`: the first form
+    shows in a wrist sensor. `played`: values that are felt in a played world, by default from the priors;
+    empty if it cannot be felt. `turns`: the parameter [rad] up to which blocks turn freely in the grip on the
+    ground. `grip` [N]: least and largest grip with which the effect shows. `exact`: the equation is what
+    happens, as a zero error is an added constant, and no simplified model of it, as Coulomb friction is.
+
+    Its words: `report(values, rig)` gives the parameters as the interface names them, `phrase(means, rig)`
+    the effect in plain words where they depend on its parameters. `patched(document, found)` writes values
+    into numbers of rig.toml and returns where each parameter is; None if the rig has no such numbers.
     """
 
     acts_on: str = "sensing"
@@ -161,19 +170,20 @@ class HandEffect(Effect):
     patched: Callable[[Any, Mapping[str, Any]], dict[str, str] | None] | None = None
     wrong: Callable[[Any, np.ndarray], list[Any]] | None = None
     turns: str = ""
+    exact: bool = False
 
     @property
     def simulated(self) -> bool:
-        """Whether the virtual model can have it."""
+        """Whether the virtual model can simulate it."""
         return bool(self.apply or self.scene or self.finish)
 
 
-# Stages: the sensor's chain backwards, then what the hand carries, then the contact.
+# Stages: the chain of the sensor backwards, then what the hand carries, then the contact.
 READOUT, FILTER, SCALE, MIX, HAND, KINEMATICS, CONTACT = range(7)
 
 
 def swung(world: World) -> tuple[Array, Array]:
-    """How the far ends of the links move with the angles: x and y (T, N, 4) [m/rad]."""
+    """Derivatives of the links' far ends with respect to their angles: x and y (T, N, 4) [m/rad]."""
     return turning((world.length * world.link)[None, None, :], world.joints)
 
 
@@ -193,19 +203,19 @@ def tips(world: World) -> tuple[Array, Array]:
 
 
 def with_mode(world: World, mode: int, on: Array) -> World:
-    """The world with one of `modes` switched on where `on` is 1."""
+    """The world with one of `modes` enabled where `on` is 1."""
     modes = np.array(world.modes, float)
     modes[mode] += on
     return world._replace(modes=modes)
 
 
 def with_load(world: World, force: Array) -> World:
-    """The world with a force (T, N, 4) [N] on each finger that is none of the contact's."""
+    """The world with a force (T, N, 4) [N] on each finger that does not act at the contact."""
     return world._replace(load=world.load + force)
 
 
 def gradient(t: Array, values: Array) -> Array:
-    """Central differences along the second axis of (T, N, C) or (T, N), times (T, N) [s]."""
+    """Central differences along the second axis of (T, N, C) or (T, N), at times (T, N) [s]."""
     step = t[:, 2:] - t[:, :-2]
     step = step[..., None] if values.ndim == 3 else step
     inner = (values[:, 2:] - values[:, :-2]) / np.maximum(step, 1e-6)
@@ -213,25 +223,48 @@ def gradient(t: Array, values: Array) -> Array:
 
 
 def flat(performance: Performance) -> np.ndarray:
-    """Forces of a performance as columns fx1, fy1, fx2, fy2 (n, 4)."""
+    """Forces of a performance as columns fx1, fy1, fx2, fy2 (n, 4) [N]."""
     return performance.force.reshape(-1, 4)
 
 
 def with_force(performance: Performance, force: np.ndarray) -> Performance:
-    """The performance with other forces (n, 4)."""
+    """The performance with other forces (n, 4) [N]."""
     return performance._replace(force=force.reshape(-1, 2, 2))
 
 
-# What many effects have in common: each gives an effect its `correct` and `apply` at once.
+# How effects write what was found into a rig.toml.
 
-# physics: what of channels fx1, fy1, fx2, fy2 net fx, net fy, grip and shear are
+
+def table(document: tomlkit.TOMLDocument, name: str) -> Table:
+    """A table of a document, appended if missing."""
+    if name not in document:
+        document.add(tomlkit.nl())
+        document.add(name, tomlkit.table(name == "effects"))
+    return document[name]  # type: ignore[return-value]
+
+
+def number(value: float) -> float:
+    """The value rounded to what a diagnosis can resolve."""
+    return float(f"{value:.6g}")
+
+
+def interval_comment(p: Mapping[str, Any]) -> str:
+    """A parameter's interval as a comment."""
+    low, high = p["interval_90"]
+    unit = "" if p["unit"] == "1" else f" {p['unit']}"
+    return "interval unknown" if None in (low, high) else f"90 % interval {low:.4g} to {high:.4g}{unit}"
+
+
+# Families of effects: each function gives an effect both its `correct` and its `apply`.
+
+# physics: net fx, net fy, grip and shear from channels fx1, fy1, fx2, fy2
 NET = np.array([[1.0, 0, 1, 0], [0, 1, 0, 1], [0.5, 0, -0.5, 0], [0, 0.5, 0, -0.5]])
-USUAL = 3.0  # prior: N; of a hand's forces: what shares of a channel are shares of
+USUAL = 3.0  # prior: N; the force that relative parameters of a force channel refer to
 
 
 class Motion(NamedTuple):
-    """What a load may depend on: times, tips' `position`, `velocity`, `acceleration` (..., 4) for x1, y1, x2,
-    y2, and how long ago each event was (..., events) [s]."""
+    """What a load may depend on: times, tips' `position`, `velocity` and `acceleration` (..., 4) for x1, y1,
+    x2, y2, and the time `since` each event (..., events) [s]."""
 
     t: Array
     position: Array
@@ -245,8 +278,10 @@ def loading(
     load: Callable[[Motion, Values], Array], given: Callable[[Values], Values] | None = None,
     **more: Any,
 ) -> HandEffect:  # fmt: skip
-    """A force load(motion, values) (..., 4) [N] on the fingers that is none of the contact's; `given` turns
-    parameters as they are reported into those that are fitted."""
+    """An effect that puts a force load(motion, values) (..., 4) [N] on the fingers, away from the contact.
+
+    `given` converts reported parameters into the fitted ones.
+    """
 
     def correct(world: World, values: Values, on: Array) -> World:
         position, velocity = tips(world)
@@ -264,10 +299,9 @@ def loading(
 
 
 def mixing(matrix: Callable[[Values], Array], **more: Any) -> HandEffect:
-    """Sensors that read matrix(values) (4, 4) times the true forces.
+    """An effect on sensors that read matrix(values) (4, 4) times the true forces.
 
-    The noise of net forces, grip and shear is by so much louder than that of corrected ones as the matrix
-    turns it.
+    Correcting the forces changes the noise of net forces, grip and shear as the matrix implies.
     """
 
     def correct(world: World, values: Values, on: Array) -> World:
@@ -278,15 +312,15 @@ def mixing(matrix: Callable[[Values], Array], **more: Any) -> HandEffect:
     def apply(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
         return with_force(p, flat(p) @ matrix(values).T)
 
-    return HandEffect(correct=correct, apply=apply, **more)
+    return HandEffect(correct=correct, apply=apply, exact=True, **more)
 
 
-Spread = Callable[[Mapping[str, Array]], list[Theta]]  # parameters to those of each force channel
-Clock = Callable[[Array, Array, Mapping[str, Array]], Array]  # (time since the start, its end, parameters)
+Spread = Callable[[Mapping[str, Array]], list[Theta]]  # from parameters to those of each force channel
+Clock = Callable[[Array, Array, Mapping[str, Array]], Array]  # of (time since the start, its end, parameters)
 
 
 def reading(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) -> Apply:
-    """`apply` of an effect on every force channel, by a `clock` of its own where one is given."""
+    """`apply` of a channel's effect on every force channel, with an optional `clock` in place of time."""
 
     def apply(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
         since = p.t - p.t[0]
@@ -298,7 +332,7 @@ def reading(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) 
 
 
 def unread(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) -> Correct:
-    """`correct` of an effect on every force channel that can be undone."""
+    """`correct` of an invertible channel effect on every force channel."""
 
     def correct(world: World, values: Values, on: Array) -> World:
         since = world.t - world.t[:, :1]
@@ -313,13 +347,13 @@ def unread(channel: ChannelEffect, spread: Spread, clock: Clock | None = None) -
 
 
 def own(channel: ChannelEffect) -> Spread:
-    """Each force channel has parameters of its own, called as the channel is where it has one."""
+    """Each force channel has its own parameters, named after the channel."""
     keys = {n: "" if len(channel.parameters) == 1 else f"_{n}" for n in channel.parameters}
     return lambda values: [{n: values[c + end] for n, end in keys.items()} for c in FORCE_CHANNELS]
 
 
 def of_forces(channel: ChannelEffect, **more: Any) -> HandEffect:
-    """An effect on channels as one on a hand's forces, each of which has its own."""
+    """A channel's effect as one on a hand's forces, each with its own parameters."""
     sized, several = channel.sized(USUAL, "N", 10.0), len(channel.parameters) > 1
     parameters = {f"{c}_{n}" if several else c: p for c in FORCE_CHANNELS for n, p in sized.items()}
     fields: dict[str, Any] = {

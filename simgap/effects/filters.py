@@ -1,4 +1,4 @@
-"""First-order filters along the samples of a trial, exact for what goes straight from sample to sample."""
+"""First-order filters along the samples of a trial, exact for signals that are linear between samples."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from scipy.signal import lfilter
 
 
 def lowpass(values: np.ndarray, time: np.ndarray | float, step: float) -> np.ndarray:
-    """First-order low-pass of (T, N, C) along N, started at rest; linear between samples.
+    """First-order low-pass of (T, N, C) along N, starting at rest; linear between samples.
 
-    `time` [s]: one of all channels, or (C,).
+    `time` [s] is the time constant of all channels, or (C,).
     """
     ratio = step / np.maximum(time, 1e-4)
     keep = np.exp(-ratio)
@@ -20,7 +20,7 @@ def lowpass(values: np.ndarray, time: np.ndarray | float, step: float) -> np.nda
 
 
 def faded(drive: np.ndarray, ratio: np.ndarray | float) -> np.ndarray:
-    """y[k] = exp(-ratio) y[k-1] + drive[k] of (T, N, C) along N; `ratio` of all channels, or (C,)."""
+    """y[k] = exp(-ratio) y[k-1] + drive[k] of (T, N, C) along N; `ratio` is that of all channels, or (C,)."""
     keep = np.exp(-np.asarray(ratio, float))
     if not keep.ndim:
         return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=1))

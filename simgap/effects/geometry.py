@@ -1,4 +1,4 @@
-"""Effects in where the fingers are: joints, links, a dead band, a hand that rolls."""
+"""Effects on where the fingers are: joint offsets, link lengths, backlash, hand roll."""
 
 from __future__ import annotations
 
@@ -10,12 +10,20 @@ from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
 from simgap import channels
 from simgap.effect import Parameter
-from simgap.effects.base import KINEMATICS, DeadBand, HandEffect, Performance, World, gradient
+from simgap.effects.base import (
+    KINEMATICS,
+    DeadBand,
+    HandEffect,
+    Performance,
+    World,
+    gradient,
+    interval_comment,
+    number,
+)
 from simgap.gap.frame import CHANNELS
 from simgap.phases import Phase
 
-# A hand that is not as its drawing says: angles read with offsets, links longer than nominal, all alike or
-# each by its own.
+# A hand that differs from its drawing: angles with offsets, links longer than nominal (all alike, or each).
 
 JOINTS = ("q11", "q12", "q21", "q22")
 LINKS = ("link11", "link12", "link21", "link22")
@@ -26,7 +34,7 @@ def _numbers(values, names, common: str = "") -> np.ndarray:
 
 
 def correct_hand(world: World, values, on) -> World:
-    """The world of the true hand."""
+    """The world as the true hand makes it."""
     return world._replace(
         joints=world.joints - _numbers(values, JOINTS) * world.jointed,
         link=world.link * (1 + _numbers(values, LINKS, "scale")),
@@ -34,12 +42,13 @@ def correct_hand(world: World, values, on) -> World:
 
 
 def apply_hand(p: Performance, values, rng) -> Performance:
-    """Tips as a nominal hand reads them that is not as nominal."""
+    """Tips as computed with nominal geometry from the angles of a deviating hand."""
     return moved_joints(p, values, lambda q: q + _numbers(values, JOINTS))
 
 
 def moved_joints(p: Performance, values, change) -> Performance:
-    """Tips as read by a nominal hand whose angles (n, 4) pass through `change`."""
+    """Tips as computed with nominal geometry from the angles (n, 4) of the true hand, passed through
+    `change`."""
     if not p.rig.jointed:
         raise ValueError("a Cartesian hand has no joints")
     longer = _numbers(values, LINKS, "scale").reshape(2, 2)
@@ -57,9 +66,8 @@ def moved_joints(p: Performance, values, change) -> Performance:
 
 
 def _patched_link_length(document, found):
-    """Links longer by `scale`, all of them, or each by its own: link11 is finger 1's first."""
-    from simgap.patch import interval_comment, number
-
+    """Put link lengths into the rig: all longer by `scale`, or each by its own share (link11: finger 1's
+    first)."""
     if "fingers" not in document:
         return None
     common = found["scale"]["mean"] if "scale" in found else 0.0
@@ -75,6 +83,7 @@ def _patched_link_length(document, found):
 
 JOINT_OFFSET = HandEffect(
     name="joint_offset",
+    exact=True,
     acts_on="kinematics",
     says="recorded q = q + q0, per joint",
     shows="positions, widths, heights, by pose",
@@ -94,6 +103,7 @@ JOINT_OFFSET = HandEffect(
 
 LINK_LENGTH = HandEffect(
     name="link_length",
+    exact=True,
     acts_on="kinematics",
     says="true link = (1 + scale) nominal, all links or each",
     shows="positions in proportion to reach",
@@ -112,35 +122,36 @@ LINK_LENGTH = HandEffect(
 
 # Joints that turn within a dead band before the sensor follows.
 
-HUSH = 3.0  # chosen: sds of an angle by which it must turn on before its joint is taken to move
-ANYWHERE = 4 / 3  # physics: mean square way from a side of a dead band to anywhere in it, in half its width
+HUSH = 3.0  # chosen: sds of an angle that it must turn by before its joint counts as moving
+ANYWHERE = 4 / 3  # physics: mean square distance from a side of a band to anywhere in it, in half its width
 
 
-def _noise_backlash(values: np.ndarray) -> np.ndarray:
+def _noise(values: np.ndarray) -> np.ndarray:
     """Noise (T, 4) of sampled signals (T, N, 4), from their second differences."""
     bend = np.abs(values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2])
     return np.maximum(np.median(bend, axis=1) / (0.6745 * np.sqrt(6)), 1e-6)
 
 
-def _moves_backlash(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Direction (T, N, 4) in which each recorded angle moves, -1, 1, or 0 where it rests; and the angle
-    without its noise: it stays where it rests."""
+def _moves(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Direction (T, N, 4) of motion of each recorded angle, -1, 1, or 0 at rest, and the angle without its
+    noise, constant at rest."""
     from simgap.recursions import play
 
-    hush = HUSH * _noise_backlash(joints)
+    hush = HUSH * _noise(joints)
     calm = np.empty_like(joints)
     for trial, joint in np.ndindex(hush.shape):
         calm[trial, :, joint] = play(joints[trial, :, joint], 2 * hush[trial, joint])
     return np.sign(np.diff(calm, axis=1, prepend=joints[:, :1])), calm
 
 
-def _nearest_backlash(moves: np.ndarray, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The last move before each sample (the next one in reverse), 0 where there is none, and how long ago.
+def _nearest_move(moves: np.ndarray, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The last move before each sample (in reverse: the next one), 0 if there is none, and its distance in
+    samples.
 
-    A sample's own noise would choose its own side, so its own move does not count.
+    A sample's own move does not count, as its noise would choose its own side.
     """
     if reverse:
-        move, ago = _nearest_backlash(moves[:, ::-1], False)
+        move, ago = _nearest_move(moves[:, ::-1], False)
         return move[:, ::-1], ago[:, ::-1]
     here = np.arange(moves.shape[1])[:, None]
     last = np.maximum.accumulate(np.where(moves != 0, here, -1), axis=1)
@@ -150,26 +161,26 @@ def _nearest_backlash(moves: np.ndarray, reverse: bool) -> tuple[np.ndarray, np.
 
 
 def within(world: World, half: float, unseen: float) -> DeadBand:
-    """Where in the dead band of so much to either side [rad] each joint lies, and what is known of that.
+    """Where in the dead band of `half` to either side [rad] each joint is, and what is known of that.
 
-    A recorded angle that moves pins its joint to the side it moves to. At rest the joint goes from one pin
-    to the next: as its speed says, unless that is `unseen`; then no one knows when, and it may have gone
-    anywhere in the band from any sample to the next. A band narrower than what an angle must turn on by to be
-    seen moving is not seen either.
+    A recorded angle that moves pins its joint to the side it moves towards. At rest the joint goes from one
+    pin to the next: as its speed says, unless speeds are `unseen`; then the time is unknown, and from any
+    sample to the next it may have gone anywhere in the band. A band too narrow for motion to be detected has
+    no effect.
     """
-    band = half * np.clip(2 * half / (HUSH * _noise_backlash(world.joints)[:, None]) - 1, 0.0, 1.0)
-    moves, calm = _moves_backlash(world.joints)
-    (last, ago), (following, ahead) = _nearest_backlash(moves, False), _nearest_backlash(moves, True)
+    band = half * np.clip(2 * half / (HUSH * _noise(world.joints)[:, None]) - 1, 0.0, 1.0)
+    moves, calm = _moves(world.joints)
+    (last, ago), (following, ahead) = _nearest_move(moves, False), _nearest_move(moves, True)
     rest = ago + ahead - 1
     share = (ago - 0.5) / rest
     share = np.where(last == 0, 1.0, np.where(following == 0, 0.0, share))
 
-    # Speeds integrated less what the sensor saw: how far the joint went in its dead band, but for a constant.
+    # Integrated speed minus the sensor's motion: how far the joint moved in its dead band, up to a constant.
     step = (world.t[:, 1:] - world.t[:, :-1])[..., None]
     went = np.cumsum(step * (world.rates[:, 1:] + world.rates[:, :-1]) / 2, axis=1)
     went = np.pad(went, ((0, 0), (1, 0), (0, 0)))
     hidden = went - calm
-    # Of a sample that moves, what the sensor saw before: its own noise must not be taken out of it.
+    # For a moving sample, the sensor's previous value: its own noise must not be removed from it.
     own = went - np.concatenate([calm[:, :1], calm[:, :-1]], axis=1)
     n = hidden.shape[1]
     here = np.arange(n)[None, :, None]
@@ -180,13 +191,13 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     free = (moves == 0) | (last != following)
     path = side + (1 - unseen) * np.where(free, own - before * (1 - share) - after * share, 0.0)
     place = np.clip(path, -band, band)
-    seen = np.square(_noise_backlash(world.rates)[:, None] * np.median(step))
-    # What noise takes on by from one sample to the next pins nothing.
+    seen = np.square(_noise(world.rates)[:, None] * np.median(step))
+    # Changes within the noise pin nothing.
     went_on = np.abs(np.diff(calm, axis=1))
     far = np.pad(went_on, ((0, 0), (1, 0), (0, 0))) + np.pad(went_on, ((0, 0), (0, 1), (0, 0)))
     return DeadBand(
         place,
-        (last == following) & (rest == 1) & (far > HUSH * _noise_backlash(world.joints)[:, None]),
+        (last == following) & (rest == 1) & (far > HUSH * _noise(world.joints)[:, None]),
         (1 - unseen) * np.diff(own, axis=1, prepend=own[:, :1]),
         np.broadcast_to((1 - unseen) * seen, place.shape),
         np.square(unseen * band[:, 0]) * ANYWHERE,
@@ -217,7 +228,7 @@ BACKLASH = HandEffect(
     check="Hold each motor still and move its fingertip by hand; look for slack in gears or cables.",
     parameters={
         "width": Parameter(0.0, 0.004, "rad", starts=(0.002, 0.006), low=0.0, high=0.05),
-        # Rates from the encoder miss what it misses (1); a tachometer's do not (0).
+        # Rates from the encoder miss what it misses (1); those of a tachometer do not (0).
         "unseen": Parameter(0.0, 0.5, starts=(1.0,), low=0.0, high=1.0, hidden=True),
     },
     forms=(("width",), ("width", "unseen")),
@@ -227,18 +238,18 @@ BACKLASH = HandEffect(
 )
 
 
-# A hand that turns a little about the grip while it carries, both fingers and the block together.
+# A hand that rotates slightly about the grip while it carries, both fingers and the block together.
 
-SLOW = 2.0  # prior: Hz; a hand with a block in it turns no faster (an arm's own modes lie above)
-VARIED = 0.5  # prior: log sd of a carry's roll about that of all: a second of it is one swing or two
+SLOW = 2.0  # prior: Hz; a hand that holds a block turns no faster (an arm's own modes are higher)
+VARIED = 0.5  # prior: log sd of a carry's roll about that of all, as a second holds only a swing or two
 ROLLS = np.geomspace(2e-4, 0.1, 40)  # prior: rad
 
 
 def _scatter_hand_roll(given, residual: np.ndarray):
-    """Roll shows in the fingers' height difference alone: its width times the angle, slowly.
+    """Variance from roll, which shows only in the fingers' height difference, slowly: width times angle.
 
-    Its power lies in the first cosines of every carry, evenly up to SLOW. A hand rolls in every carry alike:
-    what turns in some of them only is no roll of the hand.
+    Its power lies in the first cosines of each carry, evenly up to SLOW. A hand rolls in all carries;
+    rotation in only some of them is not a roll of the hand.
     """
     from scipy.fft import dct
 
@@ -262,12 +273,12 @@ def _scatter_hand_roll(given, residual: np.ndarray):
     if not (unit > 0).any():
         return None
     found = on_grid("hand_roll", square, given.nuisances.kept(rows, unit), ROLLS, rows.cell, VARIED)
-    # Its size and speed in each carry are unknown: what lies there has its own variance.
+    # Size and speed are unknown in each carry: its slow coefficients have their own variance.
     return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
 
 
 def _apply_hand_roll(performance: Performance, values, rng) -> Performance:
-    """A smooth random turn of the given root mean square, while something is carried."""
+    """A smooth random rotation of the given rms while something is carried."""
     t = performance.t
     angle = np.zeros(t.size)
     for frequency in np.arange(0.2, 1.6, 0.2):

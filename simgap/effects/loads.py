@@ -1,4 +1,4 @@
-"""Effects of what moves or pulls: fingertips' mass, drag, a cable, shocks, a structure that vibrates."""
+"""Effects of moving and pulling parts: mass of the fingertips, drag, a cable, shocks, vibration."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ VISCOUS_DRAG = loading(
 )
 
 
-# A cable that pulls on the fingers like a spring anchored somewhere. What is fitted is its force at MIDDLE.
+# A cable that pulls on the fingers like an anchored spring. The fitted parameter is its force at MIDDLE.
 
 MIDDLE = (0.13, 0.02)  # prior: m; about where the fingers work
 
@@ -92,7 +92,7 @@ CABLE_FORCE = loading(
 
 # A short pulse of vertical force when a block touches down: a raised cosine of unit area [1/s].
 
-LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known as an impulse only
+LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known only by its impulse
 
 
 def _impact(m: Motion, values):
@@ -117,9 +117,9 @@ CONTACT_IMPACT = loading(
 )
 
 
-# A lightly damped mode of the hand's structure, rung by every contact change and by every change of load.
+# A lightly damped mode of the hand's structure, excited by contact changes and by every change of load.
 
-GROUPS = (("grip", (0, 3)), ("support", (1, 2)))  # events of a move that ring alike
+GROUPS = (("grip", (0, 3)), ("support", (1, 2)))  # events of a move that excite it alike
 AMPLITUDES = tuple(
     f"{part}_{group}_{c}" for group, _ in GROUPS for part in ("sin", "cos") for c in FORCE_CHANNELS
 )
@@ -141,7 +141,8 @@ def _ringing(world: World, values) -> np.ndarray:
 
 
 def _correct_structural_vibration(world: World, values, on) -> World:
-    # What loads ring is put into what they should read, not taken out: recorded noise stays as it is.
+    # Ringing from loads is added to the prediction, not removed from the recording, whose noise stays the
+    # same.
     ring = np.array([values[n] for n in ("frequency", "damping", "drive")])
     return with_mode(world, RINGING, on)._replace(force=world.force - _ringing(world, values), ring=ring)
 

@@ -1,4 +1,4 @@
-"""Effects where fingertips touch: their stiffness, creep and slip."""
+"""Effects at the contact of fingertips: stiffness, creep and slip of their pads."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from simgap.effects.base import (
     Performance,
     World,
     flat,
+    interval_comment,
+    number,
+    table,
     with_mode,
 )
 
@@ -33,7 +36,7 @@ def _correct_fingertip_compliance(world: World, values, on) -> World:
 
 
 def _report_fingertip_compliance(draws, rig):
-    """True stiffnesses [N/m] from the additional compliances; a pad is never stiffer than 1e6 N/m."""
+    """True stiffnesses [N/m] from the additional compliances; a compliance is at least 1e-6 m/N."""
     tip, out = rig.fingertip, {}
     for name, give in draws.items():
         kind, finger = name[5:].rstrip("12"), name[-1] if name[-1] in "12" else ""
@@ -43,7 +46,7 @@ def _report_fingertip_compliance(draws, rig):
 
 
 def _admitted_fingertip_compliance(rig):
-    """Deviations of pads' stiffness [1], as those of their compliances [m/N]."""
+    """Standard deviations of the pads' compliances [m/N], from those of their stiffnesses [1]."""
     tip, sds = rig.fingertip, rig.systematic.pad_stiffness
     give = {"normal": 1 / tip.normal_stiffness, "shear": 1 / tip.shear_stiffness}
     return "fingertip_compliance/1", {f"give_{k}{i + 1}": give[k] * sds[i] for k in give for i in (0, 1)}
@@ -59,9 +62,7 @@ def _phrase_fingertip_compliance(means, rig):
 
 
 def _patched_fingertip_compliance(document, found):
-    """The pads' own numbers, each with what it was and what rig.toml says of it."""
-    from simgap.patch import interval_comment, number, table
-
+    """Put pad stiffnesses into the rig, each with its former value and comment."""
     pads = table(document, "fingertip")
     names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]
     for name in names:
@@ -102,11 +103,11 @@ FINGERTIP_COMPLIANCE = HandEffect(
 )
 
 
-# A viscoelastic arm on the pad: foam that keeps yielding while held (standard linear solid).
+# A viscoelastic arm on the pad: foam that keeps yielding under load (standard linear solid).
 #
-# Stiff at once by (1 + ratio) k and relaxing to k: with the arm's time constant T, displacement d and
+# Its stiffness is (1 + ratio) k at once and relaxes to k: with the arm's time constant T, displacement d and
 # force F obey F + T F' = k d + T (1 + ratio) k d'. Solved for d, a share ratio / (1 + ratio) of the
-# yielding follows the force late, through a low-pass of T (1 + ratio).
+# deflection follows the force through a low-pass of time constant T (1 + ratio).
 
 
 def _correct_fingertip_creep(world: World, values, on) -> World:
@@ -117,7 +118,7 @@ def _correct_fingertip_creep(world: World, values, on) -> World:
 
 
 def _apply_fingertip_creep(performance: Performance, values, rng) -> Performance:
-    """Tips of an unchanged grip force go where such a pad lets them."""
+    """Move tips at unchanged grip force as such a pad lets them."""
     pad, ratio = performance.rig.fingertip, values["ratio"]
     late = {"time_constant": values["time_constant"] * (1 + ratio)}
     force = flat(performance)
@@ -146,13 +147,12 @@ FINGERTIP_CREEP = HandEffect(
 
 # Pads that slide on the block when the shear exceeds mu times the normal force.
 #
-# A slide shows as a shift of the fingers against the block that grows only while the shear is at its
-# bound. How far it slides is free in every grip (marginalised with the grip's other constants); when
-# is told by mu.
+# Slip shows as a shift of the fingers against the block that grows only while the shear is at its bound. Its
+# extent is free in every grip (marginalised with the grip's other constants); its time is given by mu.
 
-# chosen: N; a grip lighter than this is opening or closing, when pads slide on healthy hands too
+# chosen: N; a lighter grip is opening or closing, when healthy pads slide too
 LOADED = 0.4
-HANGING = 0.9  # chosen: share of a carry, at least, that pads do not slide in: or the block would fall
+HANGING = 0.9  # chosen: least share of a carry in which pads stick, as the block would fall otherwise
 
 
 def _correct_grip_slip(world: World, values, on) -> World:

@@ -1,4 +1,5 @@
-"""Effects in how forces are read: zero errors, gains, crosstalk, turned sensors, delays, filters, steps."""
+"""Effects on force readings: bias, drift, gain, cross-talk, rotated sensors, delay, filter, quantisation,
+jitter."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ from simgap.effects.base import (
 )
 from simgap.gap.frame import CHANNELS
 
-# A constant offset of every force channel.
+# A constant offset of each force channel.
 
 
 def _phrase_force_bias(means, rig):
@@ -42,6 +43,7 @@ def _phrase_force_bias(means, rig):
 
 FORCE_BIAS = of_forces(
     BIAS,
+    exact=True,
     says="recorded F = F + b, per finger and axis",
     shows="all subtasks alike, free motion too",
     mistaken_for=("weight", "fingertip_mass"),
@@ -53,13 +55,13 @@ FORCE_BIAS = of_forces(
 )
 
 
-# Force channels that drift from the start of every trial, evenly or the slower the longer it lasts.
+# Force channels that drift from the start of each trial, at a constant or a decreasing rate.
 
 
 def _since(t, last, values):
-    """Seconds since the start; what warms up slows down.
+    """Effective seconds since the start, for a warm-up that slows down.
 
-    The bend is nothing at the start and as the last block is left: the mean slope stays as it is.
+    The bend vanishes at the start and when the last block is left, so the mean slope is kept.
     """
     return t * (1 + values.get("bend", 0.0) * (1 - t / np.maximum(last, 1e-3)))
 
@@ -77,17 +79,17 @@ FORCE_DRIFT = of_forces(
     | {"bend": Parameter(0.0, 0.15, low=-0.6, high=0.6, hidden=True, shape=True)},
     correct=unread(DRIFT, own(DRIFT), _since),
     apply=reading(DRIFT, own(DRIFT), _since),
-    played={},  # of a recording as a whole
+    played={},  # it acts on whole recordings
 )
 
 
-# Force channels that read too much or too little, in proportion: all alike, a finger's, or each its own.
+# Force channels that read too much or too little in proportion: all alike, those of a finger, or each.
 
 FINGERS = ("finger1", "finger2")
 
 
 def of_channels(values, common: str) -> np.ndarray:
-    """A parameter of each force channel (4,), made up of what is common, of its finger and of its own."""
+    """A parameter of each force channel (4,): the sum of the common one, its finger's and its own."""
     return np.array([sum(values.get(n, 0.0) for n in (common, f"finger{c[-1]}", c)) for c in FORCE_CHANNELS])
 
 
@@ -117,7 +119,7 @@ FORCE_GAIN = mixing(
 )
 
 
-# Each force axis picks up a share of the other one; and force sensors mounted with a turn.
+# Cross-talk between the axes of a force sensor, and sensors mounted with a rotation.
 
 
 def _crosstalk(values):
@@ -158,12 +160,12 @@ SENSOR_ROTATION = mixing(
 )
 
 
-# Forces that arrive late by a constant delay, or pass a first-order low-pass: of all channels, or of one
-# finger's sensor. Both are put into what loads should read, not taken out: noise would grow.
+# Forces delayed, or filtered by a first-order low-pass, in all channels or one finger's. The prediction is
+# delayed or filtered; inverting the recording would amplify its noise.
 
 
 def _of_fingers(words: str) -> Callable[[Mapping[str, float], Mapping[str, Any]], str]:
-    """These words, and the finger where it is of one alone."""
+    """A phrase of these words, naming the finger if only one is affected."""
 
     def phrase(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
         acting = [k for k, v in means.items() if v > 0]
@@ -178,6 +180,7 @@ def _spread(name: str) -> Spread:
 
 FORCE_LAG = of_forces(
     LAG,
+    exact=True,
     says="recorded F(t) = F(t - delay)",
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
@@ -202,6 +205,7 @@ FORCE_LAG = of_forces(
 
 FORCE_LOWPASS = of_forces(
     LOWPASS,
+    exact=True,
     says="time_constant dF_rec/dt + F_rec = F",
     shows="rounded contact changes",
     mistaken_for=("force_lag",),
@@ -227,16 +231,16 @@ FORCE_LOWPASS = of_forces(
 
 # Forces rounded to a step.
 
-REPEATED = 0.5  # chosen: share of repeated values that only a lattice has
-WRITTEN = 1e-5  # prior: N; how finely forces are written that were not rounded before
+REPEATED = 0.5  # chosen: share of repeated values above which they lie on a lattice
+WRITTEN = 1e-5  # prior: N; resolution to which files state forces that were not rounded before
 
 
 def _scatter_quantisation(given, residual: np.ndarray):
-    """Whether forces repeat the same values: levels of a lattice through zero.
+    """Variance from rounding, if forces repeat the levels of a lattice through zero.
 
-    Written to 1e-5 N, as files are, one sample in ten repeats another's value by chance; on a lattice
-    most do. The step is the usual gap between neighbouring levels, refined on all samples. Values that
-    were not rounded would all fall on levels so far apart with a chance of WRITTEN / step each.
+    In files written to 1e-5 N one sample in ten repeats another's value by chance; on a lattice most do. The
+    step is the median gap between neighbouring levels, refined on all samples. Values that were not rounded
+    would all fall on such levels with a chance of WRITTEN / step each.
     """
     from simgap.gap.assemble import Scatter, rounded_variance
 
@@ -246,7 +250,7 @@ def _scatter_quantisation(given, residual: np.ndarray):
     if 1 - levels.size / values.size < REPEATED or levels.size < 4:
         return None
     step = float(np.median(np.diff(levels)))
-    for reach in (4, 16, 64, 256):  # farther levels tell the step ever more closely
+    for reach in (4, 16, 64, 256):  # farther levels determine the step ever more precisely
         count = np.round(values / step)
         near = (np.abs(count) <= reach) & (count != 0)
         if near.any():
@@ -281,21 +285,21 @@ JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
 def _scatter_clock_jitter(given, residual: np.ndarray):
     from simgap.gap.assemble import on_grid, rows_of
 
-    rows, rate = rows_of(given), _rates_clock_jitter(given)[given.whitening.weight > 0]
+    rows, rate = rows_of(given), _clock_rates(given)[given.whitening.weight > 0]
     size = np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1)
     part = rows.trial * len(rows.parts) + rows.part
     return on_grid("clock_jitter", residual**2, size[rows.cell], JITTERS, part)
 
 
-def _rates_clock_jitter(given) -> np.ndarray:
-    """Whitened change per second of clock error (T, N, C): only where motion is fast."""
+def _clock_rates(given) -> np.ndarray:
+    """Whitened change per second of clock error (T, N, C), from fast motion alone."""
     world = given.frame.world
     _, velocity = tips(world)
     step = np.median(np.diff(world.t, axis=1))
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
     out = np.zeros_like(given.whitening.weight)
     # Central differences of positions read at wrong times: v times the times' difference over 2 steps; and
-    # the mean (1, 4, 1) / 6 of speeds that were read at them.
+    # the mean (1, 4, 1) / 6 of speeds read at them.
     rate = gradient(world.t, mean_v)
     for k, c in enumerate(("vx", "vy")):
         out[..., CHANNELS.index(c)] = np.hypot(mean_v[..., k] / step, rate[..., k]) / np.sqrt(2)

@@ -1,4 +1,4 @@
-"""Effects of blocks and table: inertia, centre of mass, measured properties that are wrong, tilt, give."""
+"""Effects of blocks and table: inertia, centre of mass, wrong measurements, tilt, compliance."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from simgap.effects.base import (
     with_mode,
 )
 
-# The carried block's inertia, where a quasistatic model is requested.
+# Inertia of the carried block, for use with a quasistatic model.
 
 OBJECT_INERTIA = HandEffect(
     name="object_inertia",
@@ -58,13 +58,13 @@ OFFCENTRE_MASS = HandEffect(
 )
 
 
-# A property that was measured apart from the trials, and is wrong.
+# A property measured apart from the trials, wrongly.
 
-WRONG = 0.05  # prior: share by which a measured property may be off
+WRONG = 0.05  # prior: relative error of a wrong measurement
 
 
 def _wrong_actual(given, push: np.ndarray) -> list:
-    """A candidate for each property that was measured apart."""
+    """A candidate for each property that was measured apart from the trials."""
     from simgap.attribution.problem import Candidate
 
     out, nothing = [], np.zeros(1)
@@ -94,11 +94,11 @@ ACTUAL = HandEffect(
 )
 
 
-# A support inclined from the horizontal.
+# An inclined support.
 #
-# A block of which one foot touches first turns in the grip until the other one does, and pads slide on it.
-# One that stood on a slope turns back as it is lifted, by some share of the slope: the fingers' height
-# difference changes by its width times that.
+# A block that lands on one edge first turns in the grip until the other edge lands, and pads slide on it. One
+# that stood on a slope turns back as it is lifted, by some share of the slope: the fingers' height difference
+# changes by that times the block's width.
 
 TABLE_TILT = HandEffect(
     name="table_tilt",
@@ -121,11 +121,12 @@ TABLE_TILT = HandEffect(
 )
 
 
-# A support that yields under load, a little late.
+# A support that yields under load, slightly delayed.
 
 
 def _correct_table_compliance(world: World, values, on) -> World:
-    # What yields has mass and damping: it is late by some hundredths of a second.
+    # Its mass and damping delay it by some hundredths of a second.
+
     return with_mode(world, YIELDING, on)._replace(
         give_support=world.give_support + values["give"],
         support_time=world.support_time + on * values["settling"],

@@ -11,9 +11,9 @@ from scipy.fft import dct
 from scipy.stats import norm
 
 from hmmseg.io.rig import Tolerance
-from simgap.attribution.heldout import POSITIVE
+from simgap.attribution.heldout import POSITIVE, RESPONSE
 from simgap.attribution.posterior import STATED
-from simgap.attribution.problem import BANDS, Candidate, Gap, Rows, cosines
+from simgap.attribution.problem import BANDS, MODELLED, Candidate, Gap, Rows, cosines
 from simgap.effects import catalogue, name_of
 from simgap.gap.frame import CHANNELS
 from simgap.gap.nuisances import with_nuisances
@@ -430,6 +430,7 @@ def _candidate(
         effect.name, tuple(p.name for p in free), u[own], neutral(given)[own], np.ones(own.size), shift,
         -push,
         low, high, evidence=-doubts,
+        form=RESPONSE if effect.exact else MODELLED,
         hidden=tuple(p.name for p in free if p.hidden or p.shape),
         size=np.array([1 / p.sd if p.log else np.nan for p in free]),
         frees=_turning(given, turned) if effect.turns else None,

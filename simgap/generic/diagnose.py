@@ -1,16 +1,16 @@
-"""Real against given simulated trials: a source of the same gap that blocks have, judged as theirs is.
+"""Diagnosis of real trials against given simulated trials, judged like the diagnosis of blocks.
 
-A row of the gap is a feature of a real trial less the mean of the simulated ones. Features of one channel are
-correlated: a trial that starts off stays off. So their covariance between trials has a part along the few
-ways in which whole trials differ (offset, slope, size, time) and an autocorrelated rest: a mixed model (Laird
-& Ware, Biometrics 38, 1982) by moments. Rows are whitened by its symmetric root, which leaves every row
-closest to its own feature (Kessy, Lewin & Strimmer, Am. Stat. 72, 2018). All real trials share the error of
-the simulated mean, S trials of covariance B: for R real ones of covariance A, rows are whitened by
-A + B R / S, so that their mean is known as well as it is, and their mean square is below one
+A row of the gap is a feature of a real trial minus the mean of the simulated trials. Features of a channel
+are correlated within a trial: one that starts with an offset keeps it. Their covariance between trials is
+therefore a mixed model (Laird & Ware, Biometrics 38, 1982) fitted by moments: a part along the few ways in
+which whole trials differ (offset, slope, size, time) plus an autocorrelated rest. Rows are whitened by the
+symmetric root of its inverse, which keeps each row closest to its own feature (Kessy, Lewin & Strimmer, Am.
+Stat. 72, 2018). All R real trials (covariance A) share the error of the mean of S simulated ones (covariance
+B): whitening by A + B R / S gives the mean over rows its correct precision, and rows a mean square below one
 (`Whitening.expected`).
 
-Whether there is a gap is judged by exchanging the labels real and simulated (Besag & Clifford, Biometrika 78,
-1991): exchanged trials are healthy twins.
+The null distribution is found by exchanging the labels real and simulated (Besag & Clifford, Biometrika 78,
+1991): relabelled trials are healthy twins.
 """
 
 from __future__ import annotations
@@ -37,29 +37,30 @@ from simgap.generic.ring import find_ring
 from simgap.generic.trials import FAST, SLOW, Ensembles, Layout, bin_edges, both, layout, means
 from simgap.progress import Progress, silent
 
-MODERATION = 4.0  # prior: degrees of freedom that a cell's mean variance is worth
+MODERATION = 4.0  # prior: degrees of freedom given to the mean variance of a cell
 LATE = 0.02  # numerics: s; a small delay
-PACE = 0.02  # chosen: of a duration: clocks repeat themselves exactly, and less does not matter
-NOTHING = 1e-6  # numerics: of a channel's scale: no sd is smaller
-EXCHANGES = 20  # numerics: of labels, at most
-NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
-STEP = 1e-3  # numerics: of a usual size, for derivatives by differences
-STEPS = 20  # numerics: of a fit, at most
-CLOSE = 1e-4  # numerics: relative, of a fit's cost
-APART = 1e4  # numerics: s; powers have no order in time
+PACE = 0.02  # chosen: smallest relative sd of a duration: clocks repeat exactly, and less does not matter
+SMALLEST = 1e-6  # numerics: smallest sd, as a share of a channel's scale
+EXCHANGES = 20  # numerics: most exchanges of labels
+QUIET = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
+STEP = 1e-3  # numerics: step of finite differences, in prior standard deviations
+STEPS = 20  # numerics: most function evaluations of a fit
+CLOSE = 1e-4  # numerics: relative tolerance of a fit's cost
+APART = 1e4  # numerics: s; separates powers, which have no order in time
 DURATIONS = "duration"
 POWER = ", power"
 
 
 @dataclass(frozen=True)
 class GenericDiagnosis:
-    """Everything found; `body` is the JSON document's. `real` (R, F), `sim` (S, F): features; `variance`
-    (F,) of their difference between two trials; `shift` (F,): what the best explanation adds to simulated
-    features, `leading` its effects."""
+    """The JSON document `body` and what its figures need.
+
+    `real` (R, F) and `sim` (S, F) are the features, `variance` (F,) that of their difference between two
+    trials. `shift` (F,) is what the `leading` effects, the best explanation, add to simulated features.
+    """
 
     body: dict[str, Any]
     scene: Scene
-    attribution: Attribution
     real: np.ndarray
     sim: np.ndarray
     variance: np.ndarray
@@ -74,16 +75,16 @@ def diagnose(
     """Diagnose real trials against simulated ones of the same task.
 
     Args:
-        ensembles: Both kinds of trials, cut into subtasks (`simgap.generic.trials`).
-        forced: Effects to be taken instead of choosing.
-        seed: Of the exchanged labels.
+        ensembles: Real and simulated trials, cut into subtasks (`simgap.generic.trials`).
+        forced: Effects that are imposed instead of chosen.
+        seed: Seed of the exchanged labels.
         tell: Called with a description of each stage.
 
     Returns:
         The document, and what its figures are drawn from.
 
     Raises:
-        InputError: A forced effect is unknown, or one that only the virtual model has.
+        InputError: A forced effect is unknown, or needs the virtual model.
     """
     for name in forced:
         if name not in effects():
@@ -93,32 +94,32 @@ def diagnose(
     real, sim = both(lay)
     given = scene(lay, find_ring(lay))
     tell("fitting effects")
-    white, gap = searched(given, real, sim)
+    white, gap = fitted_gap(given, real, sim)
     models = None
     if not forced:
         models = sought(forms(gap))
         leading = tuple(gap.candidates[j].name for j in models[0].effects)
         if len(leading) > 1:
-            more = _joint(given, white, fit(given, white, real, sim, leading), len(real))
-            gap, models = replace(gap, candidates=(*gap.candidates, *more)), None
+            together = _joint(given, white, fit(given, white, real, sim, leading), len(real))
+            gap, models = replace(gap, candidates=(*gap.candidates, *together)), None
     tell("attributing the gap")
 
     def twins(value: float) -> Iterable[float]:
-        return _exchanged(given, real, sim, seed) if value > NIL else ()
+        return _exchanged(given, real, sim, seed) if value > QUIET else ()
 
     verdict = attribute(gap, twins, tuple(dict.fromkeys(forced)), seed, models=models)
     return _document(given, gap, white, verdict, real, sim)
 
 
-def searched(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Whitening, Gap]:
-    """The gap with every effect fitted by itself, and what whitens it."""
+def fitted_gap(given: Scene, real: np.ndarray, sim: np.ndarray) -> tuple[Whitening, Gap]:
+    """The whitening, and the gap with each effect fitted separately as its candidates."""
     white = whitening(given, real, sim)
     found = (_candidates(white, fit(given, white, real, sim, (n,)), len(real)) for n in effects())
     return white, gap_of(given.layout, white, real, sim, [c for forms in found for c in forms])
 
 
 def _exchanged(given: Scene, real: np.ndarray, sim: np.ndarray, seed: int) -> Iterator[float]:
-    """The statistic where other trials are called real; the courses that effects act on stay as they are."""
+    """Statistics under exchanged labels; effects still act on the original simulated courses."""
     every, count = np.concatenate([real, sim]), len(real)
     rng, total = np.random.default_rng(seed), comb(len(every), count)
     if total <= 10 * EXCHANGES:
@@ -126,16 +127,16 @@ def _exchanged(given: Scene, real: np.ndarray, sim: np.ndarray, seed: int) -> It
         chosen = [chosen[k] for k in rng.permutation(len(chosen))]
     else:
         chosen = [rng.permutation(len(every))[:count] for _ in range(EXCHANGES)]
-    for mine in chosen[:EXCHANGES]:
-        there = np.isin(np.arange(len(every)), mine)
-        f = forms(searched(given, every[there], every[~there])[1])
+    for labelled in chosen[:EXCHANGES]:
+        as_real = np.isin(np.arange(len(every)), labelled)
+        f = forms(fitted_gap(given, every[as_real], every[~as_real])[1])
         yield statistic(f, sought(f, 1))
 
 
 @dataclass(frozen=True)
 class Whitening:
-    """Of a row of the gap: the `root` (F, F) that whitens it, channel by channel, its variances (F,), and the
-    mean squares (F,) of the whitened one."""
+    """The matrix `root` (F, F) that whitens a row of the gap channel by channel, the row's variances (F,),
+    and the mean squares (F,) `expected` of the whitened row."""
 
     root: np.ndarray
     variance: np.ndarray
@@ -143,14 +144,14 @@ class Whitening:
 
 
 def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> Whitening:
-    """What whitens the rows of the gap of so many real trials."""
+    """The whitening for features of real (R, F) and simulated trials (S, F)."""
     lay, kinds = given.layout, [v for v in (real, sim) if len(v) > 1]
     root, (variance, expected) = np.zeros((lay.kind.size, lay.kind.size)), np.zeros((2, lay.kind.size))
     for c in lay.every:
         index = lay.of_channel(c)
         basis = _common(given, c) if c >= 0 else np.zeros((index.size, 0))
         each = [_covariance(lay, v[:, index], basis, index) for v in kinds]
-        a, b = each[0], each[-1]  # a single trial borrows the other kind's
+        a, b = each[0], each[-1]  # a kind with a single trial borrows the other's covariance
         of_row = a + b * len(real) / len(sim)
         values, vectors = np.linalg.eigh(of_row)
         own = (vectors / np.sqrt(np.maximum(values, 1e-9 * values.max()))) @ vectors.T
@@ -160,45 +161,45 @@ def whitening(given: Scene, real: np.ndarray, sim: np.ndarray) -> Whitening:
 
 
 def variances(lay: Layout, deviations: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Variances between trials (n,) by deviations (T, n), drawn towards the mean of their cell."""
+    """Variances between trials (n,) from deviations (T, n), shrunk towards the mean of their cell."""
     dof = len(deviations) - 1
     raw = (deviations**2).sum(0) / dof
     cell = np.unique(lay.subtask[index] * 3 + lay.kind[index], return_inverse=True)[1]
     pooled = (np.bincount(cell, raw) / np.bincount(cell))[cell]
     scale = np.where(lay.channel[index] >= 0, lay.scale[lay.channel[index]], 1.0)
-    # The log of a mean of m squares of noise has a variance of 2 / m, of which half is the least.
-    floor = np.where(lay.kind[index] == SLOW, (NOTHING * scale) ** 2,
+    # The log of a mean of m squares of white noise has the variance 2 / m; half of it is the floor.
+    floor = np.where(lay.kind[index] == SLOW, (SMALLEST * scale) ** 2,
                      np.where(lay.kind[index] == FAST, 1 / lay.width[index], PACE**2))  # fmt: skip
     return np.maximum((dof * raw + MODERATION * pooled) / (dof + MODERATION), floor)
 
 
 def _common(given: Scene, channel: int) -> np.ndarray:
-    """Orthonormal ways (n, q) in which whole trials differ: offset, slope, size and time of the course,
-    an offset of each subtask, loudness."""
+    """Orthonormal ways (n, q) in which whole trials differ: offset, slope, size and time of the course, an
+    offset of each subtask, and loudness."""
     lay, t, x = given.layout, given.t, given.course[channel]
-    slowly = (lay.kind[lay.of_channel(channel)] == SLOW).astype(float)
+    slow = (lay.kind[lay.of_channel(channel)] == SLOW).astype(float)
     moved = [t, x, delayed(t, x, LATE) - x]  # a drift, a gain, a lag
-    columns = [np.concatenate([means(t, m, given.bins), np.zeros(int((slowly == 0).sum()))]) for m in moved]
+    columns = [np.concatenate([means(t, m, given.bins), np.zeros(int((slow == 0).sum()))]) for m in moved]
     subtask = lay.subtask[lay.of_channel(channel)]
-    columns += [slowly * (subtask == k) for k in range(len(lay.window))] + [1 - slowly]
+    columns += [slow * (subtask == k) for k in range(len(lay.window))] + [1 - slow]
     ways = np.stack([c / max(np.linalg.norm(c), 1e-12) for c in columns], 1)
     left, size, _ = np.linalg.svd(ways, full_matrices=False)
     return left[:, size > 1e-6]
 
 
 def _covariance(lay: Layout, values: np.ndarray, basis: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Covariance (n, n) between trials: along the common ways as seen, elsewhere autocorrelated.
+    """Covariance (n, n) between trials: empirical along the common ways, autocorrelated elsewhere.
 
-    The covariance along the common ways is drawn to its diagonal by as many degrees of freedom as it has
-    rows. What remains has the features' variances and an AR(1) correlation of neighbours in the slow course.
+    The covariance along the q common ways is shrunk to its diagonal with q + 1 degrees of freedom. The rest
+    has the features' own variances and an AR(1) correlation between neighbours in the slow course.
     """
     kind, deviations = lay.kind[index], values - values.mean(0)
     dof, q = len(values) - 1, basis.shape[1]
     if not q:
         return np.diag(variances(lay, deviations, index))
     along = deviations @ basis
-    seen = along.T @ along / dof
-    seen = (dof * seen + (q + 1) * np.diag(np.diag(seen))) / (dof + q + 1)
+    common = along.T @ along / dof
+    common = (dof * common + (q + 1) * np.diag(np.diag(common))) / (dof + q + 1)
     rest = deviations - along @ basis.T
     own = variances(lay, rest, index)
     z = rest / np.sqrt(own)
@@ -207,7 +208,7 @@ def _covariance(lay: Layout, values: np.ndarray, basis: np.ndarray, index: np.nd
     rho = float((z[:, 1:] * z[:, :-1])[:, near].sum() / max((z[:, :-1] ** 2)[:, near].sum(), 1e-12))
     apart = np.abs(np.subtract.outer(np.arange(kind.size), np.arange(kind.size)))
     alike = np.where(np.logical_and.outer(slow, slow), np.clip(rho, 0.0, 0.95) ** apart, np.eye(kind.size))
-    return basis @ seen @ basis.T + alike * np.sqrt(np.outer(own, own))
+    return basis @ common @ basis.T + alike * np.sqrt(np.outer(own, own))
 
 
 def gap_of(
@@ -233,8 +234,8 @@ def gap_of(
 
 @dataclass(frozen=True)
 class Part:
-    """Effects fitted in one channel, or to one duration: coordinates `u` (k,) of their slots, `shift` (F,) of
-    all features, its derivatives (F, k) by coordinates."""
+    """Effects fitted in one channel, or to one duration: coordinates `u` (k,) of their slots, the `shift`
+    (F,) of all features, and its derivatives `slopes` (F, k) with respect to the coordinates."""
 
     slots: tuple[Slot, ...]
     u: np.ndarray
@@ -243,7 +244,7 @@ class Part:
 
 
 def shift_at(given: Scene, mine: Sequence[Slot], u: np.ndarray) -> np.ndarray:
-    """Features (n,) of a channel, or durations, with effects at coordinates u, less those without."""
+    """Change (n,) of a channel's features, or of durations, by effects at coordinates u (k,)."""
     values = [s.parameter.value(float(v)) for s, v in zip(mine, u, strict=True)]
     count = len(given.layout.window)
     if mine[0].channel < 0:
@@ -260,7 +261,7 @@ def shift_at(given: Scene, mine: Sequence[Slot], u: np.ndarray) -> np.ndarray:
 def fit(
     given: Scene, white: Whitening, real: np.ndarray, sim: np.ndarray, names: Sequence[str]
 ) -> list[Part]:
-    """Effects together fitted to the mean difference of features, channel by channel, from every start."""
+    """Fit effects jointly to the mean difference of features, channel by channel."""
     out, difference = [], real.mean(0) - sim.mean(0)
     for channel in given.layout.every:
         index = given.layout.of_channel(channel)
@@ -281,30 +282,30 @@ def fit(
 def _fitted(
     given: Scene, root: np.ndarray, target: np.ndarray, mine: Sequence[Slot]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (k,) and derivatives (n, k) of the best of all starts, by least squares within bounds and
-    with normal priors."""
+    """Coordinates (k,) and derivatives (n, k) of the best fit from all starts: bounded least squares with
+    normal priors."""
     priors, ends = np.eye(len(mine)), np.array([s.parameter.limits for s in mine]).T
     at = partial(shift_at, given, mine)
 
-    def push(u: np.ndarray) -> np.ndarray:
+    def derivatives(u: np.ndarray) -> np.ndarray:
         return (np.stack([at(u + step) for step in STEP * priors], 1) - at(u)[:, None]) / STEP
 
-    def left(u: np.ndarray) -> np.ndarray:
+    def residual(u: np.ndarray) -> np.ndarray:
         return np.concatenate([root @ (target - at(u)), u])
 
-    def slopes(u: np.ndarray) -> np.ndarray:
-        return np.concatenate([-root @ push(u), priors])
+    def jacobian(u: np.ndarray) -> np.ndarray:
+        return np.concatenate([-root @ derivatives(u), priors])
 
     starts = [[s.parameter.coordinate(v) for v in s.parameter.starts or (0.0,)] for s in mine]
     every = [np.array([s[j % len(s)] for s in starts]) for j in range(max(map(len, starts)))]
-    given_to: dict[str, Any] = {"jac": slopes, "bounds": ends, "ftol": CLOSE, "max_nfev": STEPS}
-    descents = [least_squares(left, np.clip(u, *ends), **given_to) for u in every]
+    options: dict[str, Any] = {"jac": jacobian, "bounds": ends, "ftol": CLOSE, "max_nfev": STEPS}
+    descents = [least_squares(residual, np.clip(u, *ends), **options) for u in every]
     u = min(descents, key=lambda d: d.cost).x
-    return u, push(u)
+    return u, derivatives(u)
 
 
 def _candidates(white: Whitening, found: Sequence[Part], count: int) -> list[Candidate]:
-    """One effect in all channels (or subtasks, of durations), and in that alone in which it explains most."""
+    """One effect acting in all channels (durations: subtasks), and only in the one it explains most of."""
     if not found:
         return []
     gains = [float(np.square(white.root @ p.shift).sum()) for p in found]
@@ -313,8 +314,8 @@ def _candidates(white: Whitening, found: Sequence[Part], count: int) -> list[Can
 
 
 def _joint(given: Scene, white: Whitening, found: Sequence[Part], count: int) -> list[Candidate]:
-    """The effects of a joint fit as candidates where they are together: of each what is gone without it; what
-    they do only together is parted evenly."""
+    """The effects of a joint fit as candidates: the shift of each is what vanishes without it, plus an equal
+    part of what they do only together."""
     names = list(dict.fromkeys(s.effect for p in found for s in p.slots))
     lay, whole, alone, own = given.layout, np.sum([p.shift for p in found], 0), {}, {}
     for name in names:
@@ -331,12 +332,13 @@ def _joint(given: Scene, white: Whitening, found: Sequence[Part], count: int) ->
 
 
 def _candidate(white: Whitening, parts: Sequence[Part], shift: np.ndarray, count: int) -> Candidate:
+    """Fitted parts of one effect, with their `shift` (F,), as a candidate on the rows of `count` trials."""
     mine, u = [s for p in parts for s in p.slots], np.concatenate([p.u for p in parts])
     slopes = np.concatenate([p.slopes for p in parts], 1)
     low, high = np.array([s.parameter.limits for s in mine]).T
-    moved, pushed = np.tile(white.root @ shift, count), np.tile(white.root @ slopes, (count, 1))
+    moved, jacobian = np.tile(white.root @ shift, count), np.tile(white.root @ slopes, (count, 1))
     return Candidate(mine[0].effect, tuple(s.label for s in mine), u, np.zeros(u.size), np.ones(u.size),
-                     moved, pushed, low, high)  # fmt: skip
+                     moved, jacobian, low, high)  # fmt: skip
 
 
 def _document(
@@ -346,14 +348,14 @@ def _document(
     lay, far, rest = given.layout, verdict.how_far, verdict.remainder
     best = next((m for m in verdict.models if m.effects), verdict.models[0])
     leading = verdict.causes or tuple(gap.candidates[j].name for j in best.effects)
-    effects = {n: _described(given, verdict, [n]) for n in verdict.effects}
+    described = {n: _described(given, verdict, [n]) for n in verdict.effects}
     if len(verdict.causes) > 1:
-        effects["+".join(verdict.causes)] = _described(given, verdict, verdict.causes)
+        described["+".join(verdict.causes)] = _described(given, verdict, verdict.causes)
     attribution = {n: (e.probability, e.share, e.share_90) for n, e in verdict.effects.items()}
     body = entries(verdict, verdict.detection, (rest.share, rest.p_value, _cells(lay, rest.where)),
                    attribution, _cells(lay, verdict.where))  # fmt: skip
     shrinkage = None if far is None else far.to_json()
-    body |= {"effects": effects, "shrinkage": shrinkage, "next_experiment": None}
+    body |= {"effects": described, "shrinkage": shrinkage, "next_experiment": None}
     warnings = [*lay.ensembles.warnings]
     if len(real) == 1:
         warnings.append("one real trial: nothing is held out, and an accident of it looks like an effect")
@@ -364,11 +366,11 @@ def _document(
         x = np.array([p.mean for p in e.parameters.values()])
         moved += (c.shift + c.jacobian @ (x - c.at))[: lay.kind.size]
     shift = np.linalg.solve(white.root, moved)
-    return GenericDiagnosis(body, given, verdict, real, sim, white.variance, shift, leading, tuple(warnings))
+    return GenericDiagnosis(body, given, real, sim, white.variance, shift, leading, tuple(warnings))
 
 
 def _cells(lay: Layout, found: Sequence[Any]) -> list[dict[str, Any]]:
-    """Rows of the document; a power's band is that of its window."""
+    """Cells as the document lists them; the band of a power is that of its window."""
     out = rows(found)
     for row in out:
         if row["channel"].endswith(POWER):
@@ -380,19 +382,18 @@ def _cells(lay: Layout, found: Sequence[Any]) -> list[dict[str, Any]]:
 
 
 def _described(given: Scene, verdict: Attribution, names: Sequence[str]) -> dict[str, Any]:
-    """Parameters and evidence of some effects."""
+    """Parameters and evidence of effects that act together."""
     out = dict[str, Any]()
     for name in names:
         prefix = f"{name}." if len(names) > 1 else ""
         out |= {prefix + k: v for k, v in _parameters(given, name, verdict.effects[name].parameters).items()}
     odds = log_odds(verdict.effects[n].probability for n in names)
-    return {"parameters": out, "log_evidence": odds, "property_shift": {},
-            "heldout_score": None if len(names) < 2 or verdict.how_far is None else verdict.how_far.score,
-            }  # fmt: skip
+    score = None if len(names) < 2 or verdict.how_far is None else verdict.how_far.score
+    return {"parameters": out, "log_evidence": odds, "property_shift": {}, "heldout_score": score}
 
 
 def _parameters(given: Scene, name: str, found: Mapping[str, ParameterPosterior]) -> dict[str, Any]:
-    """An effect's parameters in units, by channel or subtask; of a vibration frequency, damping and size."""
+    """An effect's parameters in units, by channel or subtask; frequency, damping and size of a vibration."""
     lay, out = given.layout, dict[str, Any]()
     rung = dict[tuple[int, int], list[tuple[float, float]]]()
     of = {s.label: s for c in lay.every for s in slots(given, name, c)}

@@ -1,8 +1,8 @@
-"""What effects that need no contact model do to simulated trials.
+"""Effects that need no contact model, applied to given simulated trials.
 
-Each acts in one channel on the mean simulated course and on the simulated trials, whose powers are then
-recomputed, or on durations. A channel has the effects of `simgap.channels`, from the true value outwards;
-vibration and noise are added to what they give.
+An effect acts in one channel, on the mean simulated course and on every simulated trial (whose powers are
+then recomputed), or on durations. A channel passes through the effects of `simgap.channels` in order, from
+the true value outwards; vibration and noise are added to the result.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from simgap.generic.ring import LEAST, Ring
 from simgap.generic.trials import Cut, Layout, bin_edges, means, powers, resampled, transformed, windowed
 
 FINE = 2048  # numerics: points of the mean course
-LINE = 1e-12  # numerics: of a channel: a straight line bends less from step to step
-COARSE = 10.0  # prior: what a given simulation is off by, of what a calibrated robot's sensors are
+LINE = 1e-12  # numerics: relative change of slope per step, below which a course is a straight line
+COARSE = 10.0  # prior: errors of a given simulation over those of a calibrated robot's sensors
 NOISE = "noise_level"
 
 
 @dataclass(frozen=True)
 class EnsembleEffect(ChannelEffect):
-    """An effect on given trials. `each`: one in each channel, one a channel and event (an oscillation's sine
-    and cosine), or one a subtask (durations)."""
+    """An effect on given trials, with parameters for `each` channel, each event of each channel (sine and
+    cosine of an oscillation), or each subtask (durations)."""
 
     each: str = "channel"
 
 
 @cache
 def effects() -> dict[str, ChannelEffect]:
-    """All effects on given trials, those of any channel by the names that they have in a hand's forces."""
+    """All effects on given trials by name; those on any channel are named as in a hand's forces."""
     own = (
         EnsembleEffect(
             "structural_vibration", "a damped mode rung at the start of a subtask",
@@ -58,7 +58,7 @@ def effects() -> dict[str, ChannelEffect]:
 
 @dataclass(frozen=True)
 class Slot:
-    """A parameter of an effect in a channel (-1: durations); `place`: its event or subtask, else -1."""
+    """A parameter of an effect in a channel (-1: durations), at `place`: its event or subtask, else -1."""
 
     effect: str
     parameter: Parameter
@@ -67,7 +67,7 @@ class Slot:
 
     @property
     def label(self) -> str:
-        """A name of its own."""
+        """A unique name within the effect."""
         return f"{self.channel}/{self.place}/{self.parameter.name}"
 
 
@@ -91,10 +91,11 @@ Acting = Mapping[str, Theta]  # values by effect
 
 @dataclass(frozen=True)
 class Scene:
-    """What predictions start from: the layout, mean real boundaries and the mean simulated course on them.
+    """What predictions start from: the layout, mean real boundaries `edges` (K + 1,) [s], and the mean
+    simulated `course` (C, FINE) stretched to them, at times `t` (FINE,) [s].
 
-    `t` (FINE,) [s] and `course` (C, FINE); `floor` (C,): power of the simulated noise; `ring`: the
-    oscillation looked for. `known`: log powers computed so far.
+    `floor` (C,) is the power of the simulated noise, `ring` the oscillation found in the real trials, `known`
+    a cache of log powers.
     """
 
     layout: Layout
@@ -112,20 +113,20 @@ class Scene:
 
     @cached_property
     def powers(self) -> list[np.ndarray]:
-        """Powers of the sub-bands (S, num_bands) of every channel, as simulated."""
+        """Simulated powers (S, num_bands) of the sub-bands of every channel."""
         return [powers(self.layout, self.layout.ensembles.sim, c) for c in range(len(self.course))]
 
     @cached_property
     def plain(self) -> list[np.ndarray]:
-        """Features of every channel without any effect."""
+        """Predicted features of every channel without effects."""
         return [predicted(self, c, {}) for c in range(len(self.course))]
 
 
 def scene(layout: Layout, ring: Ring | None = None) -> Scene:
-    """The scene of two ensembles; simulated courses are stretched to the mean real durations, but for what
-    follows an event."""
+    """The scene of two ensembles. Simulated courses are stretched to the mean real durations, except for the
+    time right after each event."""
 
-    def knots(edges: np.ndarray) -> np.ndarray:  # times that correspond between trials
+    def knots(edges: np.ndarray) -> np.ndarray:  # corresponding times of all trials
         return np.sort(np.concatenate([edges, edges[:-1] + layout.event]))
 
     edges = np.mean([c.edges - c.edges[0] for c in layout.ensembles.real], 0)
@@ -139,7 +140,7 @@ def scene(layout: Layout, ring: Ring | None = None) -> Scene:
 
 
 def _floor(layout: Layout) -> np.ndarray:
-    """Power of the simulated noise (C,): the quietest subtask's upper quarter of the spectrum."""
+    """Power of the simulated noise (C,): the upper quarter of the quietest subtask's spectrum."""
     out = np.zeros(len(layout.ensembles.channels))
     for c in range(out.size):
         spectra = [np.square([transformed(windowed(layout, cut, c, k)) for cut in layout.ensembles.sim])
@@ -149,7 +150,7 @@ def _floor(layout: Layout) -> np.ndarray:
 
 
 def read(t: np.ndarray, values: np.ndarray, acting: Acting) -> np.ndarray:
-    """Values (n,) as they are read where these effects act."""
+    """Values (n,) recorded under the given effects."""
     for effect in reversed(channel_effects().values()):
         theta = acting.get(f"force_{effect.name}")
         if theta is not None:
@@ -158,7 +159,8 @@ def read(t: np.ndarray, values: np.ndarray, acting: Acting) -> np.ndarray:
 
 
 def _rung(given: Scene, t: np.ndarray, starts: np.ndarray, rung: np.ndarray) -> np.ndarray:
-    """A vibration (n,) at times [s] that is rung at the subtasks' starts with amplitudes (K, 2)."""
+    """A vibration (n,) at times t [s], excited at the subtasks' `starts` [s] with amplitudes `rung` (K,
+    2)."""
     out = np.zeros(t.size)
     for k in np.flatnonzero(rung.any(1)):
         assert given.ring is not None
@@ -167,9 +169,9 @@ def _rung(given: Scene, t: np.ndarray, starts: np.ndarray, rung: np.ndarray) -> 
 
 
 def predicted(given: Scene, channel: int, acting: Acting, rung: np.ndarray | None = None) -> np.ndarray:
-    """Predicted features of a channel in the order of `Layout.of_channel`.
+    """Predicted features of a channel, in the order of `Layout.of_channel`.
 
-    `rung` (K, 2): sine and cosine amplitudes of a vibration from each subtask's start on.
+    `rung` (K, 2): sine and cosine amplitudes of a vibration that starts with each subtask.
     """
     rung = np.zeros((len(given.layout.window), 2)) if rung is None else rung
     x = read(given.t, given.course[channel], acting) + _rung(given, given.t, given.edges[:-1], rung)
@@ -180,13 +182,13 @@ def predicted(given: Scene, channel: int, acting: Acting, rung: np.ndarray | Non
 
 
 def _log_powers(given: Scene, channel: int, acting: Acting, rung: np.ndarray) -> np.ndarray:
-    """Mean log powers of the simulated trials' sub-bands in all subtasks, as they are read.
+    """Mean log powers of the simulated trials' sub-bands in all subtasks under the given effects.
 
-    What lies at the noise floor is the sensor's own noise, which is added behind what it is read through: its
-    power there is put back to what it was.
+    Power at the noise floor is the sensor's own noise, which is added after the effects: it is restored.
     """
     plain, x, least = given.powers[channel], given.course[channel], given.layout.least[channel]
-    straight = np.ptp(np.diff(read(given.t, x, acting) - x)) < LINE * (1 + np.abs(x).max())  # in no spectrum
+    # An added straight line is in no spectrum.
+    straight = np.ptp(np.diff(read(given.t, x, acting) - x)) < LINE * (1 + np.abs(x).max())
     found = plain
     if not straight or rung.any():
         cuts = given.layout.ensembles.sim
@@ -200,8 +202,8 @@ def _log_powers(given: Scene, channel: int, acting: Acting, rung: np.ndarray) ->
 
 
 def _as_read(given: Scene, cut: Cut, channel: int, acting: Acting, rung: np.ndarray) -> np.ndarray:
-    """A simulated trial's channel (n,) as it is read. A second before its start was as the first one,
-    mirrored: what is held has no noise."""
+    """A simulated trial's channel (n,) as recorded. The second before its start mirrors the first one: a held
+    value would have no noise."""
     t, values = cut.trial.t, cut.trial.channels[given.layout.ensembles.channels[channel]]
     there = np.isfinite(values)
     values = values if there.all() else np.interp(t, t[there], values[there])
@@ -212,7 +214,7 @@ def _as_read(given: Scene, cut: Cut, channel: int, acting: Acting, rung: np.ndar
 
 
 def _response(lay: Layout, acting: Acting) -> np.ndarray:
-    """By how much the power of white noise is multiplied in the sub-bands (num_bands,) of all subtasks."""
+    """Power gain (num_bands,) of the effects for white noise, in the sub-bands of all subtasks."""
     t, click = np.arange(FINE) / lay.rate, np.zeros(FINE)
     click[FINE // 8] = 1.0
     heard = read(t, click, acting) - read(t, np.zeros(FINE), acting)

@@ -1,9 +1,9 @@
-"""A structure that rings after an event: found in recorded trials, without a model of it.
+"""A structure that rings after an event, found in recorded trials without a model of it.
 
-y(t) = parabola + exp(-damping w t) (A sin w t + B cos w t) from the largest swing on, w = 2 pi f; A, B and
-the parabola of every trial its own, f and damping common. For given f and damping that is linear least
-squares (variable projection: Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973); the two are searched on a
-grid and refined. Intervals from the scatter between trials (jackknife), which needs no noise model.
+From the largest swing on, y(t) = parabola + exp(-damping w t) (A sin w t + B cos w t) with w = 2 pi f. A, B
+and the parabola differ from trial to trial, f and damping are common. For given f and damping the fit is
+linear (variable projection: Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973); these two are searched on a grid
+and refined. Intervals come from the scatter between trials (jackknife), which needs no noise model.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from scipy.special import stdtrit
 
 from simgap.generic.trials import Cut, Layout, resampled, windowed
 
-LEAST = 4  # numerics: coefficients that a mean power is taken of
-DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: where searches start
-LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: damping below or beyond which it is no ring
-FREQUENCIES = 80  # numerics: where searches start
-SWING = 1 / 3  # chosen: of a window within which the largest swing is looked for
-SHORTEST = 12  # numerics: samples of a window in which an oscillation is looked for
-PERIODS = 1.5  # chosen: of the slowest oscillation looked for that a window holds
-HIGHEST = 0.4  # chosen: of the sampling rate
-RINGS = 0.2  # chosen: share of the square after an event that an oscillation must explain
+LEAST = 4  # numerics: fewest coefficients in a mean power
+DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: grid of the search
+LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: range of damping ratios that count as ringing
+FREQUENCIES = 80  # numerics: points of the search's grid
+SWING = 1 / 3  # chosen: first share of a window, searched for the largest swing
+SHORTEST = 12  # numerics: samples; an oscillation is searched for in no shorter window
+PERIODS = 1.5  # chosen: periods of the slowest oscillation that a window must hold
+HIGHEST = 0.4  # chosen: highest frequency searched, over the sampling rate
+RINGS = 0.2  # chosen: share of the variance after an event that an oscillation must explain
 
 
 @dataclass(frozen=True)
 class Ring:
-    """`frequency` [Hz] and `damping` (ratio to critical) with standard errors and 90 % intervals."""
+    """`frequency` [Hz] and `damping` (ratio to critical), with standard errors and 90 % intervals."""
 
     frequency: float
     damping: float
@@ -40,16 +40,17 @@ class Ring:
     damping_90: tuple[float, float]
 
     def waves(self, t: np.ndarray) -> np.ndarray:
-        """Its sine and cosine (2, n) at times [s] since its event; 0 before."""
+        """Damped sine and cosine (2, n) at times t (n,) [s] since the event; 0 before it."""
         omega, since = 2 * np.pi * self.frequency, np.maximum(t, 0.0)
         decay = np.where(t >= 0, np.exp(-self.damping * omega * since), 0.0)
         return decay * np.array([np.sin(omega * since), np.cos(omega * since)])
 
 
 def find_ring(lay: Layout) -> Ring | None:
-    """The strongest oscillation after an event in the real trials, where they hold more power than the
-    simulated ones; after the last event from as long as all of them go on, for what is compared may end
-    sooner."""
+    """The strongest oscillation after an event, where real trials have more power than simulated ones.
+
+    After the last event all that was recorded is searched, as what is compared may end sooner.
+    """
     kinds, best, found = (lay.ensembles.real, lay.ensembles.sim), 0.0, None
     last = len(lay.ensembles.subtasks) - 1
     compared = float(np.mean([c.edges[-1] - c.edges[-2] for c in kinds[0]]))
@@ -64,7 +65,7 @@ def find_ring(lay: Layout) -> Ring | None:
             real, sim = (np.array([windowed(lay, cut, c, k) for cut in kind]) for kind in kinds)
             if real.shape[1] < 4 * LEAST or real.var(1).mean() < sim.var(1).mean():
                 continue
-            rest = real - sim.mean(0)  # what the simulation has is no ring
+            rest = real - sim.mean(0)  # what is simulated too is no ringing
             windows = list(rest if rest.var(1).mean() < real.var(1).mean() else real)
             if k == last and since.size:
                 windows = [beyond(cut, name) for cut in kinds[0]]
@@ -77,10 +78,8 @@ def find_ring(lay: Layout) -> Ring | None:
 
 
 def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Windows (trials, n) from the largest departure from each one's median on, cut to equal length.
-
-    The largest swing is looked for in the first third.
-    """
+    """Windows (trials, n) of equal length, each from its largest swing on: the largest deviation from its
+    median in its first third."""
     cut = []
     for values in windows:
         early = values[: max(int(values.size * SWING), 1)]
@@ -90,15 +89,15 @@ def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
-    """The ring common to several windows.
+    """Fit the oscillation common to several windows.
 
     Args:
         windows: Samples (trials, n), from a swing on.
-        rate: Of the samples [Hz].
+        rate: Sampling rate [Hz].
 
     Returns:
-        The ring; None where windows are too short, or the best frequency lies at an end of the range that
-        they resolve, or the best damping is none of a ring.
+        The ring; None where windows are too short, or the best frequency or damping lies at an end of its
+        range.
     """
     ends = np.log([_range(windows, rate), (LIGHTEST, HEAVIEST)])
 
@@ -130,7 +129,7 @@ def _range(windows: np.ndarray, rate: float) -> tuple[float, float]:
 
 
 def _screened(windows: np.ndarray, rate: float) -> tuple[float, float, float]:
-    """Best frequency [Hz] and damping on a grid, and the share of the square about each window's parabola
+    """Best frequency [Hz] and damping on a grid, and the share of the variance about each window's parabola
     that they leave: 1 where windows are too short."""
     low, high = _range(windows, rate)
     if windows.shape[1] < SHORTEST or low >= high:
@@ -141,15 +140,15 @@ def _screened(windows: np.ndarray, rate: float) -> tuple[float, float, float]:
 
 
 def _left(windows: np.ndarray, rate: float, frequency: float, damping: float) -> float:
-    """Share of the square about each window's parabola that a ring leaves, mean over trials."""
+    """Share of the variance about each window's parabola that a ring leaves, mean over trials."""
     angle = 2 * np.pi * frequency * np.arange(windows.shape[1]) / rate
     waves = np.exp(-damping * angle) * np.array([np.sin(angle), np.cos(angle)])
     basis, rest = np.linalg.qr(_detrended(waves).T)[0], _detrended(windows)
-    size = np.maximum(np.square(rest).sum(1), 1e-300)  # each trial counts alike
+    size = np.maximum(np.square(rest).sum(1), 1e-300)  # every trial has the same weight
     return max(1 - float((np.square(rest @ basis).sum(1) / size).mean()), 1e-300)
 
 
 def _detrended(windows: np.ndarray) -> np.ndarray:
-    """Windows (trials, n) without the parabola that fits each best."""
+    """Windows (trials, n) minus the parabola that fits each best."""
     basis = np.linalg.qr(np.vander(np.linspace(-1, 1, windows.shape[1]), 3))[0]
     return windows - windows @ basis @ basis.T

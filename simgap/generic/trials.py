@@ -1,11 +1,11 @@
-"""Real and simulated trials of one ordered task: cut into the same subtasks, and what of them is compared.
+"""Real and simulated trials of an ordered task, cut into the same subtasks, and the features that compare
+them.
 
-A subtask begins with an event, and what follows at once (an impact, a snap) takes its own time: the first
-half second at most is compared second for second. The rest of the course follows the task's pace and is
-compared at equal shares of what remains of the subtask; of both, means of equal parts. What fluctuates has
-a clock of its own (a structure rings at its frequency however slowly the robot moves), so its spectrum is
-taken in seconds from the subtask's start, over a window that every trial fills. All features of a trial
-make one row.
+The slow course of a subtask is described by means over bins. What follows the event at its start (an impact,
+a snap) has its own pace, so up to half a second after it is compared at equal times; the rest follows the
+pace of the task and is compared at equal shares of the remaining subtask. Fluctuations have a clock of their
+own (a structure rings at its frequency however slowly the robot moves), so their spectrum is taken in seconds
+from the subtask's start, over a window that every trial fills. All features of a trial make one row.
 """
 
 from __future__ import annotations
@@ -22,25 +22,26 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align as align_blocks
+from hmmseg.segmentation.spans import Segmentation
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import SequenceModel
 from hmmseg.sequence.segment import segment_sequence
 
 SPREAD = (0.05, 0.95)  # chosen: quantiles whose distance is a channel's scale
-BINS = 16  # chosen: parts of a subtask whose means are compared, of which
-EARLY = 6  # chosen: lie in the time after its event,
-EVENT = 0.5  # chosen: s, or a quarter of the shortest
-SUB_BANDS = 8  # chosen: of fast power, evenly spaced in log frequency
-LOWEST = 6  # chosen: half periods in the window that fast power starts from
-FEWEST = 3  # chosen: coefficients of a sub-band; a window must give a band at least
-FLOOR = 1e-4  # chosen: of a channel's scale: power below this is no different from none
+BINS = 16  # chosen: bins of a subtask whose means are compared
+EARLY = 6  # chosen: of these, the bins in the time right after its event
+EVENT = 0.5  # chosen: s; that time, or a quarter of the shortest trial's subtask
+SUB_BANDS = 8  # chosen: sub-bands of fast power, evenly spaced in log frequency
+LOWEST = 6  # chosen: half periods per window at which fast power begins
+FEWEST = 3  # chosen: fewest DCT coefficients of a sub-band, and of a window's fast power
+FLOOR = 1e-4  # chosen: rms over a channel's scale, below which fast power counts as none
 SLOW, FAST, DURATION = range(3)
 TASK_SPACE = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A trial and the edges (K + 1,) [s] of its K subtasks. It may go on after the last one."""
+    """A trial and the edges (K + 1,) [s] of its K subtasks; it may go on after the last one."""
 
     trial: Trial
     edges: np.ndarray
@@ -48,7 +49,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Ensembles:
-    """Cut trials of both kinds; `channels` are common to all, `subtasks` those that every trial shows."""
+    """Cut trials of both kinds, the `channels` common to all, and the `subtasks` that every trial shows."""
 
     subtasks: tuple[str, ...]
     channels: tuple[str, ...]
@@ -65,6 +66,20 @@ class Ensembles:
                              "more of one kind at least: how trials scatter must be known")  # fmt: skip
 
 
+def _cut(
+    trials: Sequence[Trial], found: Sequence[Segmentation], warnings: list[str], seen: Sequence[str] = ()
+) -> tuple[Cut, ...]:
+    """Trials cut at their subtasks (`seen`: these alone); one that does not fit its task adds a warning."""
+    out = []
+    for trial, segmentation in zip(trials, found, strict=True):
+        if not segmentation.complete:
+            warnings.append(f"{trial.name}: does not fit its task and is left out")
+            continue
+        spans = [s for s in segmentation.spans if not seen or s.subtask in seen]
+        out.append(Cut(trial, np.array([spans[0].start, *(s.end for s in spans)])))
+    return tuple(out)
+
+
 def align(
     real: Sequence[Trial],
     sim: Sequence[Trial],
@@ -76,20 +91,18 @@ def align(
 
     Args:
         real: Recorded trials.
-        sim: Simulated ones.
+        sim: Simulated trials.
         task: Their task.
-        model: Emissions and durations; without them they are learned from all trials together, every channel
-            first brought to the median and spread of its own kind: a bias or a gain between the kinds must
-            not displace boundaries.
-        boundaries: By file the boundaries [s], one fewer than subtasks, or as many with the end of what is
-            compared; they replace the HMM.
+        model: Emissions and durations. By default they are learned from all trials together, each channel
+            standardised within its kind so that a bias or gain between the kinds displaces no boundary.
+        boundaries: Boundaries [s] between the subtasks, by file, that replace the HMM's.
 
     Returns:
         The cut trials; those that do not fit the task are left out, with a warning.
 
     Raises:
-        InputError: A kind has no complete trial, a trial lacks a channel, boundaries are none of the task, or
-            there are too few trials to know how they scatter.
+        InputError: A kind has no complete trial, a trial lacks a channel, boundaries do not fit the task, or
+            there are too few trials to estimate their scatter.
     """
     every, channels = [*real, *sim], _channels([*real, *sim], task)
     if boundaries is not None:
@@ -100,15 +113,9 @@ def align(
     found = segment_sequence(both, given.task, given)
     shown = [{s.subtask for s in each.spans} for each in found if each.complete]
     seen = tuple(n for n in task.sequence if n not in task.optional or all(n in names for names in shown))
-    kinds: tuple[list[Cut], list[Cut]] = [], []
-    warnings = []
-    for k, (trial, segmentation) in enumerate(zip(every, found, strict=True)):
-        if not segmentation.complete:
-            warnings.append(f"{trial.name}: does not fit its task and is left out")
-            continue
-        spans = [s for s in segmentation.spans if s.subtask in seen]
-        kinds[k >= len(real)].append(Cut(trial, np.array([spans[0].start, *(s.end for s in spans)])))
-    return Ensembles(seen, channels, tuple(kinds[0]), tuple(kinds[1]), tuple(warnings))
+    warnings, n = list[str](), len(real)
+    first, second = (_cut(every[part], found[part], warnings, seen) for part in (slice(n), slice(n, None)))
+    return Ensembles(seen, channels, first, second, tuple(warnings))
 
 
 def align_block_trials(real: Sequence[Trial], sim: Sequence[Trial], task: BlockTask, rig: Rig) -> Ensembles:
@@ -116,36 +123,32 @@ def align_block_trials(real: Sequence[Trial], sim: Sequence[Trial], task: BlockT
 
     Args:
         real: Recorded trials.
-        sim: Simulated ones.
+        sim: Simulated trials.
         task: Their task.
         rig: The nominal hand of both.
 
     Returns:
-        The cut trials, whose channels are those of task space.
+        The cut trials, in the channels of task space.
 
     Raises:
         InputError: A kind has no trial that shows the whole task.
     """
-    kinds: tuple[list[Cut], list[Cut]] = [], []
-    warnings, names = [], ()
-    for kind, trials in zip(kinds, (real, sim), strict=True):
-        for one in align_blocks(trials, task, rig).trials:
-            trial, signal, found = one.trial, one.signals, one.segmentation
-            if not found.complete:
-                warnings.append(f"{trial.name}: does not fit its task and is left out")
-                continue
-            names = tuple(s.label for s in found.spans)
-            edges = np.array([found.spans[0].start, *(s.end for s in found.spans)])
-            channels = {c: np.asarray(getattr(signal, c)) for c in TASK_SPACE}
-            kind.append(Cut(Trial(trial.file, np.asarray(signal.t), channels), edges))
-        if not kind:
+    kinds, warnings, names = [], list[str](), ()
+    for trials in (real, sim):
+        aligned = align_blocks(trials, task, rig).trials
+        signals = [{c: np.asarray(getattr(a.signals, c)) for c in ("t", *TASK_SPACE)} for a in aligned]
+        moved = [Trial(a.trial.file, s.pop("t"), s) for a, s in zip(aligned, signals, strict=True)]
+        found = [a.segmentation for a in aligned]
+        kinds.append(_cut(moved, found, warnings))
+        if not kinds[-1]:
             raise InputError(trials[0].file, "does not fit its task", "a recording that shows every subtask")
-    return Ensembles(names, TASK_SPACE, tuple(kinds[0]), tuple(kinds[1]), tuple(warnings))
+        names = next(tuple(s.label for s in each.spans) for each in found if each.complete)
+    return Ensembles(names, TASK_SPACE, kinds[0], kinds[1], tuple(warnings))
 
 
 def _edges(trial: Trial, inner: np.ndarray, task: SequenceTask) -> np.ndarray:
-    whole = len(inner) == len(task.sequence)  # with the end of what is compared
-    edges = np.concatenate([trial.t[:1], np.asarray(inner, float), [] if whole else trial.t[-1:]])
+    """Edges (K + 1,) [s] of the subtasks from the boundaries that are given for a trial."""
+    edges = np.concatenate([trial.t[:1], np.asarray(inner, float), trial.t[-1:]])
     if edges.size != len(task.sequence) + 1 or not (np.diff(edges) > 0).all():
         raise InputError(f"boundaries of {trial.file}", f"found {np.asarray(inner).tolist()}",
                          f"{len(task.sequence) - 1} increasing times within the trial")  # fmt: skip
@@ -153,6 +156,7 @@ def _edges(trial: Trial, inner: np.ndarray, task: SequenceTask) -> np.ndarray:
 
 
 def _channels(trials: Sequence[Trial], task: SequenceTask) -> tuple[str, ...]:
+    """The channels to compare: the task's, or all that the trials share."""
     names = task.channels or tuple(n for n in trials[0].channels if all(n in t.channels for t in trials))
     for trial in trials:
         for name in names:
@@ -164,7 +168,7 @@ def _channels(trials: Sequence[Trial], task: SequenceTask) -> tuple[str, ...]:
 
 
 def _standardised(trials: Sequence[Trial], channels: tuple[str, ...]) -> list[Trial]:
-    """Trials whose channels have median 0 and spread 1 over all of them."""
+    """Trials with every channel shifted and scaled to median 0 and spread 1 over all of them."""
     out: list[dict[str, np.ndarray]] = [{} for _ in trials]
     for name in channels:
         values = np.concatenate([t.channels[name] for t in trials])
@@ -176,12 +180,13 @@ def _standardised(trials: Sequence[Trial], channels: tuple[str, ...]) -> list[Tr
 
 @dataclass(frozen=True)
 class Layout:
-    """What each of F features is: arrays (F,) of `channel` (-1: a duration), `subtask`, `kind` and `width`
-    (DCT coefficients of a power).
+    """What each of the F features of a trial is: arrays (F,) of its `channel` (-1: a duration), `subtask`,
+    `kind` (SLOW, FAST, DURATION) and `width` (number of DCT coefficients in a power).
 
-    `event` (K,) [s]: how long a subtask is compared second for second (0 for the first, which begins with
-    the recording); `window` (K,) [samples] of fast power; `coefficients[k]`: sub-bands as slices of its
-    DCT; `bins` (K,): parts of the course; `scale` (C,) of channels; `rate` [Hz] common to all.
+    Of K subtasks: the time `event` (K,) [s] after the start that is compared at equal times (0 for the first,
+    which begins with the recording), the `window` (K,) of fast power in samples, the `coefficients` (slices
+    of the window's DCT, one per sub-band) and the number of `bins` (K,) of the slow course. `scale` (C,) are
+    the channels' spreads, `rate` [Hz] is common to all trials.
     """
 
     ensembles: Ensembles
@@ -198,21 +203,21 @@ class Layout:
 
     @property
     def least(self) -> np.ndarray:
-        """Power (C,) below which a channel's is no different from none."""
+        """Power (C,) below which a channel's counts as none."""
         return (FLOOR * self.scale) ** 2
 
     @property
     def every(self) -> tuple[int, ...]:
-        """All channels, and -1 of durations."""
+        """All channels, then -1 for durations."""
         return (*range(len(self.ensembles.channels)), -1)
 
     def of_channel(self, channel: int) -> np.ndarray:
-        """Indices of a channel's features: slow ones of all subtasks, then fast ones; of -1 the durations."""
+        """Indices of a channel's features, slow ones of all subtasks before fast ones (-1: durations)."""
         return np.flatnonzero(self.channel == channel)
 
 
 def layout(given: Ensembles) -> Layout:
-    """Features that all trials have. Kinds recorded at different rates are compared at the lower one."""
+    """The features common to all trials. Kinds recorded at different rates are compared at the lower one."""
     rate = min(float(np.median([c.trial.rate for c in kind])) for kind in (given.real, given.sim))
     durations = np.array([np.diff(c.edges) for c in (*given.real, *given.sim)])
     shortest = durations.min(0)
@@ -236,7 +241,7 @@ def layout(given: Ensembles) -> Layout:
 
 
 def bin_edges(given: Layout, edges: np.ndarray) -> np.ndarray:
-    """Edges [s] of the parts of all subtasks (sum of `bins` + 1,), which lie between `edges` (K + 1,) [s]."""
+    """Edges (sum of `bins` + 1,) [s] of all bins of subtasks between `edges` (K + 1,) [s]."""
     out = [edges[:1]]
     for start, end, count, early in zip(edges, edges[1:], given.bins, given.event, strict=False):
         if not early or count < BINS:
@@ -248,13 +253,13 @@ def bin_edges(given: Layout, edges: np.ndarray) -> np.ndarray:
 
 
 def _sub_bands(low: int, window: int) -> tuple[slice, ...]:
-    """Up to SUB_BANDS slices of DCT coefficients from `low`, none of fewer than FEWEST."""
+    """Up to SUB_BANDS slices of the DCT coefficients from `low` on, each with at least FEWEST."""
     if window - low < FEWEST:
         return ()
     out, start = [], low
     for edge in np.geomspace(low, window, SUB_BANDS + 1)[1:]:
         stop = round(edge)
-        if window - stop < FEWEST:  # what would be left is too narrow
+        if window - stop < FEWEST:  # the rest would be too narrow
             out.append(slice(start, window))
             break
         if stop - start >= FEWEST:
@@ -264,7 +269,8 @@ def _sub_bands(low: int, window: int) -> tuple[slice, ...]:
 
 
 def resampled(t: np.ndarray, values: np.ndarray, times: np.ndarray, rate: float) -> np.ndarray:
-    """A signal with gaps at other times; averaged over 1 / rate where it was sampled much faster."""
+    """Resample a signal with gaps at `times` (n,) [s]: averaged over 1 / rate if it was sampled much faster,
+    else interpolated."""
     known = np.isfinite(values)
     if 1 / np.median(np.diff(t)) < 1.5 * rate:
         return np.interp(times, t[known], values[known])
@@ -272,7 +278,7 @@ def resampled(t: np.ndarray, values: np.ndarray, times: np.ndarray, rate: float)
 
 
 def means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Mean values of a linearly interpolated signal between neighbouring edges (along the last axis)."""
+    """Means of a linearly interpolated signal between neighbouring edges [s] (along the last axis)."""
     total = cumulative_trapezoid(values, t, initial=0.0)
     # Between samples the integral of a straight line is a parabola.
     k = np.clip(np.searchsorted(t, edges, side="right") - 1, 0, t.size - 2)
@@ -283,9 +289,9 @@ def means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def transformed(values: np.ndarray) -> np.ndarray:
-    """DCT coefficients (..., n) of windows (..., n) without their straight lines.
+    """Orthonormal DCT (..., n) of windows (..., n) minus their straight lines.
 
-    White noise of variance s² has s² in the square of every coefficient.
+    The square of every coefficient of white noise has its variance as expectation.
     """
     n = values.shape[-1]
     at = np.arange(n) - (n - 1) / 2
@@ -296,14 +302,14 @@ def transformed(values: np.ndarray) -> np.ndarray:
 def windowed(
     given: Layout, cut: Cut, channel: int, subtask: int, values: np.ndarray | None = None
 ) -> np.ndarray:
-    """Samples (window,) of a channel from a subtask's start on, or of other `values` at its times."""
+    """Samples (window,) of a channel, or of other `values` at its times, from a subtask's start on."""
     n, t = int(given.window[subtask]), cut.trial.t
     if values is None:
         values = cut.trial.channels[given.ensembles.channels[channel]]
     first = int(np.searchsorted(t, cut.edges[subtask] - 0.5 / given.rate))
     inside = slice(first, first + n)
     times = cut.edges[subtask] + (np.arange(n) + 0.5) / given.rate
-    # Recorded samples as they are where they serve: between them noise would be smoothed.
+    # Recorded samples are kept where they fit: interpolation would smooth the noise.
     if first <= t.size - n and np.isfinite(values[inside]).all():
         off = (t[inside] - t[first]) * given.rate - np.arange(n)
         if np.abs(off).max() < 0.75:
@@ -314,7 +320,7 @@ def windowed(
 def powers(
     given: Layout, cuts: Sequence[Cut], channel: int, values: Sequence[np.ndarray | None] | None = None
 ) -> np.ndarray:
-    """Mean powers (num_cuts, num_bands) of all subtasks' sub-bands in a channel, or in `values` instead."""
+    """Mean powers (num_cuts, num_bands) of all subtasks' sub-bands in a channel, or in other `values`."""
     out, every = [np.zeros((len(cuts), 0))], [None] * len(cuts) if values is None else values
     for k, own in enumerate(given.coefficients):
         if own:
@@ -326,7 +332,7 @@ def powers(
 
 
 def features(given: Layout, cut: Cut) -> np.ndarray:
-    """All features (F,) of one trial: means in the channel's unit, log powers, log durations."""
+    """All features (F,) of a trial: bin means in the channel's unit, log powers, log durations."""
     out, edges = np.zeros(given.kind.size), bin_edges(given, cut.edges)
     out[given.of_channel(-1)] = np.log(np.diff(cut.edges))
     for c, name in enumerate(given.ensembles.channels):

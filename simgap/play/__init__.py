@@ -1,1 +1,1 @@
-"""The virtual blocks to be felt: fingertips on springs, worlds side by side, a session that is recorded."""
+"""Virtual blocks to be felt: fingertips on springs, two worlds side by side, a recorded session."""

@@ -1,7 +1,7 @@
-"""The session served to one browser on this machine: a page, and a socket for the hand and the blocks.
+"""A web server for one browser on this machine: a page, and a socket for the hand and the blocks.
 
-Sixty times a second the physics is advanced by the milliseconds that have passed and what the page draws is
-sent. Only loopback is listened to, only the page's own origin may open the socket, and only one does.
+Sixty times a second the physics advances by the elapsed milliseconds and the new frame is sent. The server
+listens on the loopback interface only, and only one page of its own origin may open the socket.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from simgap.play.world import effect_values, felt_effects
 
 HOST = "127.0.0.1"
 FRAME = 1 / 60  # look: s
-BEHIND = 50  # look: ms; a machine that cannot keep up lets the played time run slower
+BEHIND = 50  # look: ms; most that one frame advances: a slower machine plays in slow motion
 LONGEST_MESSAGE = 4096  # limit: bytes
 
 
 def _digest_of(page: bytes, kind: str) -> str:
-    """The page's one inline script or style, as a content security policy names it."""
+    """Hash of the page's only inline script or style, as a content security policy states it."""
     inside = page.partition(f"<{kind}>".encode())[2].partition(f"</{kind}>".encode())[0]
     return f"'sha256-{base64.b64encode(hashlib.sha256(inside).digest()).decode()}'"
 
 
 class PlayServer:
-    """Serves a session; `output` is the folder that the page's button saves into."""
+    """Serves a session; `output` is the folder for the trials that the page saves."""
 
     def __init__(self, session: Session, output: Path) -> None:
         self.session, self.output = session, output
@@ -49,7 +49,7 @@ class PlayServer:
         self._server: Server | None = None
 
     async def start(self, port: int = 0) -> str:
-        """Listen on a port of this machine (0: any that is free); the page's address."""
+        """Listen on a port of this machine (0: any free one); the page's address."""
         page = files("simgap.play").joinpath("page.html").read_bytes()
         sockets: list[str] = []
         inline = {kind: _digest_of(page, kind) for kind in ("script", "style")}
@@ -125,7 +125,7 @@ class PlayServer:
             await asyncio.sleep(max(FRAME - (time.monotonic() - now), 0.001))
 
     async def _handled(self, message: str | bytes) -> dict[str, Any] | None:
-        """Act on a message of the page; one that cannot be read changes nothing and is answered so."""
+        """Act on a message of the page; a malformed one changes nothing and is answered with an error."""
         try:
             request = json.loads(message)
             kind = request["kind"]
@@ -143,15 +143,15 @@ class PlayServer:
             else:
                 raise ValueError(kind)
         except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
-            return {"kind": "said", "text": "a message that says nothing"}
+            return {"kind": "said", "text": "unreadable message"}
         return None
 
     async def _change(self, name: str | None) -> dict[str, Any]:
-        """Switch an effect of the second world on or off."""
+        """Switch an effect of the second world on (or off: None)."""
         if name is not None and (not isinstance(name, str) or name not in felt_effects()):
             return {"kind": "said", "text": "no such effect"}
         world = None
-        if name is not None:  # compiled while the page goes on
+        if name is not None:  # compiled while the page keeps running
             world = await asyncio.to_thread(self.session.world_with, {name: effect_values(name)})
         self.session.compare_with(world)
         return self._scene()

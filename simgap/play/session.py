@@ -1,4 +1,4 @@
-"""A session: one hand's commands in one or two worlds side by side, and what it records."""
+"""A session: one hand commands one or two worlds side by side, and is recorded."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, parse_task
 from simgap.play.world import STIFFNESS, PlayedWorld
-from simgap.world.dynamics import CONTROL_PERIOD
+from simgap.world.dynamics import CONTROL_PERIOD, interpolated
 from simgap.world.properties import Blocks, lay_out
 from simgap.world.simulate import record, scene_files, trial_csv
 
-RATE = 100.0  # look: Hz of the recording where the rig says none
-CLEARANCE = 0.012  # look: m that the open hand is wider than the widest block
-CLOSING = 0.1  # look: m/s at which the hand closes and opens
-FOLLOWING = 14.0  # look: 1/s: how quickly the command follows the mouse (critically damped)
+RATE = 100.0  # look: Hz; of the recording if the rig states none
+CLEARANCE = 0.012  # look: m; opening of the hand in excess of the widest block
+CLOSING = 0.1  # look: m/s; speed at which the hand closes and opens
+FOLLOWING = 14.0  # look: 1/s; rate at which the command follows the mouse (critically damped)
 FASTEST = 0.4  # look: m/s
-LOWEST = 0.004  # look: m above the ground for the commanded fingertips
+LOWEST = 0.004  # look: m; lowest commanded fingertips above the ground
 GRIP = 3.0  # look: N
 LONGEST = 600.0  # limit: s of a recording
 
 
 def default_rig() -> Rig:
-    """Fingertips on foam pads as the project's recordings have them, recorded without joints."""
+    """Fingertips on foam pads as in the included recordings, recorded without joints."""
     pads = {"normal_stiffness": 4000.0, "shear_stiffness": 2500.0}
     return Rig.read(
         {"rate": RATE, "fingertip": pads, "noise": {"position": 2e-5, "velocity": 3e-3, "force": 0.01}}
@@ -36,7 +36,7 @@ def default_rig() -> Rig:
 
 
 def default_task(objects: list[str]) -> BlockTask:
-    """All on the ground; the first goes onto the second, or down again where there is none."""
+    """All objects on the ground; the first is moved onto the second, or down again if there is none."""
     to = objects[1] if len(objects) > 1 else "ground"
     task = parse_task(
         {"objects": {name: {"on": "ground"} for name in objects}, "moves": [{"object": objects[0], "to": to}]}
@@ -46,10 +46,10 @@ def default_task(objects: list[str]) -> BlockTask:
 
 
 class Session:
-    """The nominal world, a second one if wanted, and the hand that both follow.
+    """The nominal world, optionally a second one, and the hand that both follow.
 
-    Aim with `aim` (the hand's middle, closed or open) or `touch` (each finger by itself), let time pass
-    with `advance`, read `frame`, `save` what was recorded since `reset`.
+    `aim` (the hand's middle, closed or open) or `touch` (each finger) sets the target, `advance` lets time
+    pass, `frame` gives the current state, and `save` writes what was recorded since `reset`.
     """
 
     def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, seed: int = 0) -> None:
@@ -66,11 +66,11 @@ class Session:
         self.reset()
 
     def world_with(self, effects: Mapping[str, Mapping[str, float]]) -> PlayedWorld:
-        """Another world with these effects, ready to run next to the nominal one."""
+        """Another world with these effects, ready to run beside the nominal one."""
         return PlayedWorld(self.task, self.rig, self.blocks, self.x, self.nominal.start, effects)
 
     def compare_with(self, world: PlayedWorld | None) -> None:
-        """Run another world next to the nominal one, or none; both restart."""
+        """Run another world beside the nominal one, or none; both restart."""
         self.other = world
         self.reset()
 
@@ -80,7 +80,7 @@ class Session:
         return [self.nominal] if self.other is None else [self.nominal, self.other]
 
     def reset(self) -> None:
-        """Everything back to the start; the recording restarts."""
+        """Return everything to the start; the recording restarts."""
         for world in self.worlds:
             world.reset()
         self.command, self.rate = self.nominal.start.copy(), np.zeros((2, 2))
@@ -89,19 +89,19 @@ class Session:
         self._rows: list[np.ndarray] = []
 
     def aim(self, x: float, y: float, closed: bool, grip: float = GRIP) -> None:
-        """The hand's middle [m] and whether it closes, with so much force [N]; other numbers are ignored."""
+        """Aim the hand's middle at x, y [m], closed with a grip [N] or open; ignored unless finite."""
         if np.isfinite([x, y, grip]).all():
             self.target = np.clip([x, y], [-0.2, LOWEST], [0.5, 0.4])
             self.closed, self.grip, self.fingers = bool(closed), float(np.clip(grip, 0.5, 8.0)), None
 
     def touch(self, places: np.ndarray) -> None:
-        """Both fingers by themselves, (2, 2) [m]: two touches."""
+        """Aim both fingers separately at places (2, 2) [m] of two touches; ignored unless finite."""
         if places.shape == (2, 2) and np.isfinite(places).all():
             ordered = places[np.argsort(places[:, 0])]
             self.fingers = np.clip(ordered, [-0.2, LOWEST], [0.5, 0.4])
 
     def advance(self, steps: int) -> None:
-        """So many milliseconds."""
+        """Advance by a number of milliseconds."""
         for _ in range(steps):
             self._follow()
             for world in self.worlds:
@@ -113,7 +113,7 @@ class Session:
                 )
 
     def _follow(self) -> None:
-        """The command goes after the mouse as a hand does: smoothly, no faster than it can."""
+        """Let the command follow the mouse as a hand would: smoothly, with limited speed."""
         if self.fingers is not None:
             self.rate = self._drawn(self.fingers - self.command, self.rate)
             self.command = self.command + CONTROL_PERIOD * self.rate
@@ -130,20 +130,20 @@ class Session:
 
     @staticmethod
     def _drawn(way: np.ndarray, rate: np.ndarray) -> np.ndarray:
-        """Rates (n, 2) [m/s] a millisecond on, drawn along ways (n, 2) [m] that are left."""
+        """Rates (n, 2) [m/s] one millisecond later, given the remaining ways (n, 2) [m]."""
         rate = rate + CONTROL_PERIOD * (FOLLOWING**2 * way - 2 * FOLLOWING * rate)
         speed = np.linalg.norm(rate, axis=1, keepdims=True)
         return rate * np.minimum(1.0, FASTEST / np.maximum(speed, 1e-9))
 
     def scene(self) -> dict[str, Any]:
-        """What does not change: the blocks' sizes and the other world's effect."""
+        """The constant part of the page: sizes of the blocks, and the other world's effect."""
         sizes = {name: [block.width, block.height, block.weight] for name, block in self.blocks.items()}
         effects = {} if self.other is None else self.other.effects
         return {"kind": "scene", "blocks": sizes, "effects": effects, "home": self.home.tolist(),
                 "open": self.open, "stiffness": STIFFNESS}  # fmt: skip
 
     def frame(self) -> dict[str, Any]:
-        """What the page draws now."""
+        """The current frame of the page."""
         worlds = [
             {"tips": world.position.tolist(), "force": world.felt.tolist(),
              "blocks": world.model.block_positions().tolist()}
@@ -152,10 +152,10 @@ class Session:
         return {"kind": "frame", "t": self.nominal.t, "command": self.command.tolist(), "worlds": worlds}
 
     def save(self, folder: Path) -> list[Path]:
-        """The nominal world's recording as the next trial_NN.csv, with rig, task and true properties.
+        """Save the nominal world's recording as the next trial_NN.csv, with rig, task and true properties.
 
-        ValueError where there is less than a second of it, InputError where the folder is another session's.
-        No file that is there is replaced.
+        ValueError if it is shorter than a second, InputError if the folder belongs to another session.
+        Existing files are never replaced.
         """
         rows = np.array(self._rows)
         if len(rows) < 1000:
@@ -163,7 +163,7 @@ class Session:
         rate = self.rig.rate or RATE
         t = np.arange(int(len(rows) * CONTROL_PERIOD * rate)) / rate
         fine = np.arange(1, len(rows) + 1) * CONTROL_PERIOD
-        at = np.stack([np.interp(t, fine, column) for column in rows.T], axis=1).reshape(t.size, 3, 2, 2)
+        at = interpolated(t, fine, rows.reshape(-1, 3, 2, 2))
         self.check_folder(folder)
         number = 1
         while (folder / f"trial_{number:02d}.csv").exists():
@@ -178,7 +178,7 @@ class Session:
         return [folder / name for name in texts]
 
     def check_folder(self, folder: Path) -> None:
-        """InputError where a rig, a task or properties are in the folder that are not this session's."""
+        """InputError if the folder holds another session's rig, task or properties."""
         for name, text in scene_files(self.task, self.rig, self.blocks).items():
             there = folder / name
             if there.exists() and (not there.is_file() or there.read_bytes() != text.encode()):

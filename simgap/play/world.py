@@ -1,4 +1,5 @@
-"""A played world: the virtual model, effects that can be felt, and a hand on springs from a command."""
+"""A played world: the virtual model with perceptible effects, and a hand on springs that follows a
+command."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from simgap.world.virtual_model import Surroundings, VirtualModel, finite_stiffn
 
 SOFTEST = 50.0  # look: N/m; a softer pad would let the fingers through
 SLIPPIEST = 1e-3  # look: the least friction
-OFTEN = 3.0  # look: prior standard deviations of a sensor's effect: strong enough to be seen
+OFTEN = 3.0  # look: prior standard deviations of a sensor effect that is strong enough to be seen
 
 
 def felt_effects() -> dict[str, HandEffect]:
@@ -33,7 +34,7 @@ def felt_effects() -> dict[str, HandEffect]:
 
 
 def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Parameters of an effect as given; without any, strong enough to be felt, in its first form.
+    """Parameters of an effect, as given; by default those of its first form, strong enough to be felt.
 
     InputError for an unknown effect.
     """
@@ -42,14 +43,15 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
         raise InputError(f"effect {name}", "cannot be felt in a played world", nearest(name, known))
     parameters, forms = known[name].parameters, known[name].forms
     nothing = {n: p.nominal if p.log or p.shape else 0.0 for n, p in parameters.items()}
-    first = forms[0] if forms else tuple(nothing)  # forms overlap: a gain of a finger and that of both
+    first = forms[0] if forms else tuple(nothing)  # forms overlap: gains of a finger and of both, say
     strong = {n: OFTEN * p.sd for n, p in parameters.items() if n in first and not (p.log or p.shape)}
     usual = known[name].played or nothing | ({} if given else strong)
     return dict(usual) | {key: float(value) for key, value in (given or {}).items() if np.isfinite(value)}
 
 
 def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, Surroundings]:
-    """Rig, blocks and surroundings with the scene effects among these, pads no softer than can be played."""
+    """Rig, blocks and surroundings under the scene effects among these, with pads stiff enough to be
+    played."""
     hand, around, blocks = scene_of(rig, blocks, effects)
     stiff = {n: getattr(hand.fingertip, n) for n in ("normal_stiffness", "shear_stiffness")}
     pads = {n: float(np.clip(v, SOFTEST, finite_stiffness(np.inf))) for n, v in stiff.items()}
@@ -60,24 +62,24 @@ def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, 
 def sensed(
     effects: Values, t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig
 ) -> np.ndarray:
-    """Forces (n, 2, 2) [N] as sensors with these effects say them, of a stretch of motion at times t (n,)."""
+    """Forces (n, 2, 2) [N] read by sensors with these effects, for a stretch of motion at times t (n,)
+    [s]."""
     nothing, known = np.zeros(t.size), felt_effects()
     mine = {name: values for name, values in effects.items() if known[name].acts_on == "sensing"}
     truth = Performance(t, position, velocity, force, np.zeros(0), rig, nothing, nothing + 1.0)
     return altered(truth, mine, np.random.default_rng(0)).force
 
 
-# look: a fingertip's mass [kg], spring [N/m] and damping (ratio): the middle of what operators are drawn
-# with.
+# look: a fingertip's mass [kg], spring [N/m] and damping (ratio): the middle of the operators' ranges
 MASS, STIFFNESS, RATIO = 0.14, 450.0, 0.9
 DAMPING = 2 * RATIO * np.sqrt(MASS * STIFFNESS)
-WINDOW = 600  # look: ms of motion that a sensor's effect looks back on
+WINDOW = 600  # look: ms of motion that a sensor effect can look back on
 
 
 class PlayedWorld:
-    """Blocks and two fingertips; `advance` by a millisecond with the fingers' commanded places.
+    """Blocks and two fingertips; `advance` moves them by a millisecond under commanded finger positions.
 
-    `position`, `velocity`, `force` (2 fingers, 2 axes) [m, m/s, N]: the tips now and what they exert.
+    `position`, `velocity`, `force` (2 fingers, 2 axes) [m, m/s, N] of the tips, forces on the blocks.
     """
 
     def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, x: Mapping[str, float], start: np.ndarray,
@@ -90,7 +92,7 @@ class PlayedWorld:
         self.reset()
 
     def reset(self) -> None:
-        """Blocks back to where they stood, tips to where they began."""
+        """Return blocks and tips to the start."""
         self.model.reset()
         self.position, self.velocity = self.start.copy(), np.zeros((2, 2))
         self.force = np.zeros((2, 2))
@@ -98,7 +100,7 @@ class PlayedWorld:
         self._past: deque[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = deque(maxlen=WINDOW)
 
     def advance(self, command: np.ndarray, rate: np.ndarray) -> None:
-        """A millisecond: the springs pull the tips to `command` (2, 2) [m], moving at `rate` [m/s]."""
+        """Advance a millisecond: springs pull the tips to `command` (2, 2) [m], moving at `rate` [m/s]."""
         pull = STIFFNESS * (command - self.position) + DAMPING * (rate - self.velocity)
         self.velocity = self.velocity + CONTROL_PERIOD / MASS * (pull - self.force)
         self.position = self.position + CONTROL_PERIOD * self.velocity
@@ -109,7 +111,8 @@ class PlayedWorld:
 
     @property
     def felt(self) -> np.ndarray:
-        """Forces (2, 2) [N] as this world's sensors say them."""
+        """Forces (2, 2) [N] as read by this world's sensors."""
+
         if not self.effects or not self._past:
             return self.force
         t, position, velocity, force = map(np.array, zip(*self._past, strict=True))

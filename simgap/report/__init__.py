@@ -1,1 +1,1 @@
-"""A diagnosis for people, from its JSON alone: in words, tables and figures."""
+"""A diagnosis for people, in words, tables and figures."""

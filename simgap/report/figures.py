@@ -1,5 +1,5 @@
-"""Figures of a diagnosis: of its JSON where, which suspects, how far; of signals the recorded, simulated and
-corrected course where they part most."""
+"""Figures of a diagnosis: from its JSON where the gap is, which causes are suspected and how far it shrinks;
+from the signals, the recorded, simulated and corrected course where they differ most."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis
 from simgap.generic.diagnose import GenericDiagnosis
 from simgap.report.finding import CHANNELS, by_place, chances, plain_name, share_of
-from simgap.report.robot import Course, Own, courses
+from simgap.report.robot import Course, Own, courses, residuals
 from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
 
@@ -24,7 +24,7 @@ Body = Mapping[str, Any]
 def draw_all(
     found: Diagnosis | GenericDiagnosis, subtasks: Sequence[str], path: Callable[[str], Path]
 ) -> None:
-    """All figures of a diagnosis, at the paths that `path(name)` gives."""
+    """Draw all figures of a diagnosis, at the paths that `path(name)` gives."""
     body = found.body
     draw_heat_map(body, subtasks, path("gap_where.png"))
     draw_suspects(body, path("gap_probabilities.png"))
@@ -34,7 +34,7 @@ def draw_all(
 
 
 def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path | None = None) -> Axes:
-    """Share of the gap by channel and subtask, all trials together: the numbers of the table."""
+    """Heat map of the gap's share by channel and subtask, over all trials."""
     cells = by_place(body)
     channels = [*CHANNELS, *sorted({k[0] for k in cells} - set(CHANNELS))]
     if not set(CHANNELS) & {k[0] for k in cells} and cells:
@@ -51,10 +51,8 @@ def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path | None = None)
         axes.set_xticks(range(len(subtasks)), [s.replace(" ", "\n") for s in subtasks])
         for (row, column), value in np.ndenumerate(grid):
             if np.isfinite(value):
-                text, colour = (
-                    "<1" if value < 0.5 else f"{value:.0f}",
-                    "white" if value > 0.6 * top else "black",
-                )
+                text = "<1" if value < 0.5 else f"{value:.0f}"
+                colour = "white" if value > 0.6 * top else "black"
                 axes.text(column, row, text, ha="center", va="center", color=colour)
         figure.colorbar(shown, label="share of the gap [%]")
         axes.set_title("Where recording and model differ (blank: within the noise)")
@@ -62,7 +60,7 @@ def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path | None = None)
 
 
 def draw_suspects(body: Body, path: Path | None = None) -> Axes:
-    """Whether each suspect acts, and the share of the gap that it explains; else the probabilities."""
+    """Probability that each suspect acts, and the share of the gap it explains; else the verdict's sets."""
     effects = body.get("attribution")
     if effects:
         known = chances(body)
@@ -90,7 +88,8 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
 
 
 def draw_how_far(body: Body, path: Path) -> None:
-    """Mean squared residual of held-out trials before and after, against what healthy recordings leave."""
+    """Mean squared residual of held-out trials before and after correction, and that of healthy
+    recordings."""
     s = body["shrinkage"]
     with canvas(path, height=1.7) as figure:
         axes = figure.add_subplot()
@@ -100,18 +99,18 @@ def draw_how_far(body: Body, path: Path) -> None:
         if s["before"] > 20 * max(s["after"], 1e-9):
             axes.set_xscale("log")
         axes.set_xlabel(f"mean squared residual on {s['evaluated_on']} [noise variances]")
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))  # above the bars, which reach the edge
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0))  # above the bars, which may reach the edge
 
 
 def _unit(channel: str) -> tuple[float, str]:
-    """How a channel of task space is shown: a factor, and its label."""
+    """Factor and label with which a channel of task space is plotted."""
     if channel in ("fx", "fy", "grip", "shear"):
         return 1.0, f"{'net ' if channel.startswith('f') else ''}{channel} [N]"
     return 100.0, f"{channel} [cm{'/s' if channel.startswith('v') else ''}]"
 
 
 def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
-    """A recorded signal in task space, SI."""
+    """A recorded signal in task space (T,), SI units."""
     from simgap.effects.base import tips
 
     world = found.problem.frame.world
@@ -125,7 +124,7 @@ def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
 
 
 def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
-    """The signal where the excess is largest, with its whitened residual beneath."""
+    """Draw the signal with the largest excess, and its whitened residual beneath."""
     if isinstance(found, GenericDiagnosis):
         _draw_mean_course(found, path)
     else:
@@ -133,7 +132,7 @@ def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
 
 
 def _draw_trial(found: Diagnosis, path: Path) -> None:
-    """The channel and trial of the largest excess: recorded, simulated, corrected."""
+    """Draw channel and trial of the largest excess: recorded, simulated, corrected."""
     frame = found.problem.frame
     cell = max(found.cells, key=lambda c: c.energy - c.count)
     r, c, n = cell.trial, list(CHANNELS).index(cell.channel), frame.lengths[cell.trial]
@@ -162,7 +161,8 @@ def _draw_trial(found: Diagnosis, path: Path) -> None:
 
 
 def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:
-    """The slow course of the channel with the largest excess in one: real, simulated, with the effects in."""
+    """Draw the slow course with the largest excess in a subtask: real, simulated, with the effects
+    applied."""
     lay = found.scene.layout
     excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
     t = (found.scene.bins[1:] + found.scene.bins[:-1]) / 2
@@ -202,7 +202,7 @@ Robot = RobotDiagnosis | Changes
 def draw_robot(
     found: Robot, body: dict[str, Any], own: Mapping[str, Own], path: Callable[[str], Path]
 ) -> None:
-    """All figures, at the paths that `path(name)` gives."""
+    """Draw all figures of a robot's diagnosis, at the paths that `path(name)` gives."""
     phases = sorted({cell["subtask"] for cell in body["where"]})
     if phases:
         draw_heat_map(body, phases, path("gap_where.png"))
@@ -218,7 +218,7 @@ def _short(name: str) -> str:
 
 
 def draw_course(one: Course, found: Robot, path: Path) -> None:
-    """Recorded, simulated and corrected, and what each leaves beneath."""
+    """Draw a course recorded, simulated and corrected, with the residuals beneath."""
     if isinstance(found, Changes):
         names, how = ("as it was", "with what changed"), "run freely from its first sample"
     else:
@@ -238,10 +238,9 @@ def draw_course(one: Course, found: Robot, path: Path) -> None:
 
 
 def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
-    """Root mean square residual by log, before and after, each log predicted from the others where that was
-    done."""
-    rows, far = found.composed.rows, found.shrinkage
-    both = (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
+    """Root mean square residual by log before and after correction, cross-validated between logs if it
+    was."""
+    rows, both = found.composed.rows, residuals(found)
     logs = [r.name for r in found.composed.recordings]
     size = np.sqrt(rows.variance)
     at = np.arange(len(logs))
@@ -259,4 +258,4 @@ def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
         axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
         axes.set_ylabel("rms residual [sd of noise]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
-        axes.set_title("Held-out logs" if far is not None else "All logs")
+        axes.set_title("Held-out logs" if found.shrinkage is not None else "All logs")

@@ -1,4 +1,4 @@
-"""A diagnosis in words and tables, from its JSON alone: what it is, how sure, what remains, what to do."""
+"""A diagnosis in words and tables, from its JSON: the verdict, how sure it is, what remains, what to do."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 def plain_name(
     effect: str, means: Mapping[str, float] | None = None, rig: Mapping[str, Any] | None = None
 ) -> str:
-    """An effect, or several joined by +, in plain words; `means`: its parameters, `rig`: the model's pads."""
-    return " and ".join(_one(name, means or {}, rig or {}) for name in effect.split("+"))
-
-
-def _one(name: str, means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
-    called, _, effect = _words(name)
-    own = {k.removeprefix(f"{name}."): v for k, v in means.items()}
-    return effect.phrase(own, rig) if own and effect is not None and effect.phrase is not None else called
+    """Effects joined by +, in plain words; `means` are their parameters, `rig` the model's pads."""
+    texts = []
+    for name in effect.split("+"):
+        called, _, known = _words(name)
+        if means and known is not None and known.phrase is not None:
+            called = known.phrase({k.removeprefix(f"{name}."): v for k, v in means.items()}, rig or {})
+        texts.append(called)
+    return " and ".join(texts)
 
 
 def checks(effects: Sequence[str]) -> list[str]:
-    """What to look at on the rig, one line an effect."""
+    """What to check on the rig, one line per effect."""
     return [check for _, check, _ in map(_words, effects) if check]
 
 
-# What a part of a model has, and what to check of it: {0} is the part's name.
+# Parts of a model: what is called wrong with them, and what to check; {0} is the part's name.
 PARTS = {
     "joint.frictionloss": ("dry friction", "Turn {0} by hand, unpowered."),
     "joint.damping": ("viscous friction", "Swing {0} unpowered and watch how fast it comes to rest."),
@@ -62,7 +62,7 @@ PARTS = {
 
 
 def _part(name: str) -> tuple[str, str] | None:
-    """The same of a part of a model, such as `joint:elbow.frictionloss`; None of any other name."""
+    """Name and check of a part of a model, such as `joint:elbow.frictionloss`; None for any other name."""
     kind, of, rest = name.partition(":")
     where, _, what = rest.rpartition(".")
     if not of:  # of the whole model
@@ -75,7 +75,7 @@ def _part(name: str) -> tuple[str, str] | None:
 
 
 def _words(name: str) -> tuple[str, str, HandEffect | None]:
-    """An effect's plain name and what to check, "" where nothing is said, and the effect where it is ours."""
+    """An effect's plain name, what to check ("" if nothing), and the effect itself if it is a hand's."""
     from simgap.robot_effects import words
 
     robots = words(name) or _part(name)
@@ -112,30 +112,30 @@ WHEN = {
     "moving": "while it moves",
     "still": "while it stands still",
 }
-SAID = 3  # look: places of a gap that a sentence has
-SLOW = 1.5  # look: Hz: below it a residual is an offset for the eye
+SAID = 3  # look: most places of a gap in a sentence
+SLOW = 1.5  # look: Hz; below it a residual looks like an offset
 SURE = ((0.99, "almost certain"), (0.9, "very likely"), (0.7, "likely"), (0.0, "the best guess"))
-TINY = 1e-16  # numerics: what double precision tells from zero next to one
+TINY = 1e-16  # numerics: smallest p-value that double precision resolves next to one
 
 
 def p_text(p: float) -> str:
-    """A p-value; what is too small for its digits is only bounded."""
+    """A p-value; one too small to resolve is only bounded."""
     return f"p = {plain(p, 2)}" if p >= 1e-4 else f"p = {p:.0e}" if p > TINY else "p < 1e-16"
 
 
 def probability(body: Body) -> float:
-    """Of what the verdict names."""
+    """Probability of what the verdict names."""
     name = "+".join(body["causes"]) or body["verdict"]
     return float(body["probabilities"].get(name, 0.0))
 
 
 def sureness(p: float) -> str:
-    """A probability in a word."""
+    """A probability in words."""
     return next(word for least, word in SURE if p >= least)
 
 
 def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
-    """The causes in plain words."""
+    """The causes in plain words, with a robot's parameter values."""
     name = "+".join(body["causes"])
     found = body["effects"].get(name, {"parameters": {}})["parameters"]
     means = {k: p["mean"] for k, p in found.items() if p["mean"] is not None}
@@ -155,7 +155,7 @@ def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 
 
 def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
-    """The verdict in a line."""
+    """The verdict in one line."""
     verdict = body["verdict"]
     if "changes" in body and verdict in ("none", "unknown"):
         return "Nothing changed" if verdict == "none" else "A change that no known cause explains"
@@ -171,7 +171,7 @@ def headline(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 
 
 def sentences(body: Body) -> list[str]:
-    """What was found, how sure, and how far it goes, for an engineer who must act."""
+    """What was found, how sure it is, and how far the gap shrinks, for an engineer who must act."""
     verdict, p, small = body["verdict"], p_text(body["detection"]["p_value"]), body.get("small_gap")
     if "changes" in body:
         return changed(body)
@@ -200,7 +200,7 @@ def sentences(body: Body) -> list[str]:
 
 
 def changed(body: Body) -> list[str]:
-    """What two sets of logs show of a robot that may have changed between them."""
+    """What two sets of logs show about changes of a robot."""
     if body["verdict"] == "none":
         return ["No change that these logs can show: the model fits the new ones as well as the old ones."]
     if body["verdict"] == "unknown":
@@ -216,7 +216,7 @@ def changed(body: Body) -> list[str]:
 
 
 def doubted(body: Body) -> list[str]:
-    """The best set of causes of an unknown gap, and why it is none, where the body has them."""
+    """The best explanation of an unknown gap and the doubts about it, if the body has them."""
     best = body.get("explanation") or {}
     doubts = "; ".join(best.get("doubts", ()))
     if not doubts:
@@ -227,19 +227,19 @@ def doubted(body: Body) -> list[str]:
 
 
 def of_robot(body: Body) -> bool:
-    """Whether it is a diagnosis of a robot's logs by a model of it."""
+    """Whether the diagnosis is of a robot's logs."""
     return "numerics" in body
 
 
 def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
-    """The whole finding in a paragraph, for a terminal."""
+    """The whole finding as a paragraph, for a terminal."""
     text = " ".join([*sentences(body), *remains(body)])
     causes = f" ({', '.join(body['causes'])})" if body["causes"] else ""
     return f"{headline(body, rig)}{causes}. {text}"
 
 
 def explained(body: Body) -> str:
-    """Share of the gap that the causes explain, where the body has it."""
+    """Share of the gap that the causes explain, if the body has it."""
     parts = [(n, body.get("attribution", {}).get(n)) for n in body["causes"]]
     known = [(n, a) for n, a in parts if a and a.get("share") is not None]
     if not known:
@@ -254,7 +254,7 @@ def explained(body: Body) -> str:
 
 
 def shrunk(body: Body) -> str:
-    """How far the gap shrinks."""
+    """By how much the gap shrinks."""
     s = body.get("shrinkage")
     if not s or s.get("fraction") is None:
         return ""
@@ -286,14 +286,13 @@ def remains(body: Body) -> list[str]:
 
 
 def _noise(rest: Mapping[str, Any]) -> bool:
-    """Whether what remains is no more than noise leaves."""
+    """Whether the remainder is within the noise."""
     p = rest.get("p_value")
     return not rest.get("where") if p is None else p >= 1 - CERTAIN
 
 
 def settles(body: Body, weighed: bool) -> str:
-    """What would show more of blocks whose properties were fitted; "" where nothing is open, or they were
-    measured (`weighed`)."""
+    """Advice to measure blocks whose properties were fitted; "" if nothing is open or they were `weighed`."""
     rest = body.get("remainder") or {}
     unsure = body["verdict"] in ("set", "unknown") or (
         body["verdict"] == "named" and (probability(body) < SURE[1][0] or (rest.get("share") or 0.0) > 0.5)
@@ -307,7 +306,7 @@ def settles(body: Body, weighed: bool) -> str:
 
 
 def chances(body: Body) -> dict[str, float]:
-    """One probability of each suspect that it acts: of what the verdict names, the verdict's."""
+    """Probability of each suspect to act; of those that the verdict names, the verdict's probability."""
     known = {n: a["probability"] for n, a in (body.get("attribution") or {}).items()}
     known |= {n: body["probabilities"].get(n, 0.0) for n in body["effects"] if n not in known}
     whole = probability(body)
@@ -317,11 +316,12 @@ def chances(body: Body) -> dict[str, float]:
 
 
 def moving(body: Body, of: str = "the gap") -> list[str]:
-    """The largest parts of `where` as sentences; shares are those `of` the gap, or of what remains."""
+    """The largest entries of `where` as sentences, with shares `of` the gap or of the remainder."""
     return [_said(place, cells, of) for place, cells in list(by_place(body).items())[:SAID]]
 
 
 def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]], of: str) -> str:
+    """A sentence about the cells of one channel and subtask."""
     channel, subtask = key
     what = CHANNELS.get(channel, channel)
     share = share_of(cells)
@@ -338,13 +338,13 @@ def _said(key: tuple[str, str], cells: Sequence[Mapping[str, Any]], of: str) -> 
 
 
 def when(subtask: str) -> str:
-    """A subtask as a clause."""
+    """A subtask as an adverbial clause."""
     name, _, block = subtask.partition(" ")
     return WHEN[name].format(block or "the block") if name in WHEN else f"during {subtask}"
 
 
 def to_do(body: Body) -> list[str]:
-    """What to check on the rig, the next experiment last."""
+    """What to check on the rig, then the next experiment."""
     suspects = [*body["causes"], *body["indistinguishable"]]
     out = checks(suspects)
     following = body.get("next_experiment")
@@ -367,12 +367,12 @@ def by_place(body: Body) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
 
 
 def share_of(cells: Sequence[Mapping[str, Any]]) -> float:
-    """Their share of the gap together."""
+    """Share of the gap in several cells."""
     return float(sum(c["share"] for c in cells))
 
 
 def tables(body: Body) -> list[Table]:
-    """Probabilities, the cause's parameters, the next experiment and the largest cells, for people."""
+    """Tables of probabilities, the cause's parameters, the next experiment and the largest cells."""
     likely = sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]
     rows = [(name, f"{value:.3f}") for name, value in likely]
     out = [listed("probabilities", ("candidate", "probability"), rows, right=["probability"])]

@@ -1,4 +1,4 @@
-"""What a diagnosis of a robot leaves besides its document: courses, a history, the motion to run next."""
+"""What a robot's diagnosis leaves besides its document: courses, a history, the next motion to run."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 from hmmseg.errors import InputError
 from hmmseg.levels import CERTAIN
+from simgap.robot_effects.base import NORMAL_90
 from simgap.robots.changes import Changes
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.robots.linear import base_at
@@ -23,12 +24,10 @@ from simgap.simulators.recording import Recording
 if TYPE_CHECKING:
     from simgap.simulators.mjcf.load import Loaded
 
-NORMAL_90 = 1.645  # physics: standard deviations that a normal distribution's 90 % interval reaches
-
 
 @dataclass(frozen=True)
 class Own:
-    """How a log's column says a quantity: `offset` + `factor` x it is in the unit `si`, and it in `unit`."""
+    """How a log's column states a quantity: value in `si` = `offset` + `factor` * value in `unit`."""
 
     si: str
     factor: float
@@ -36,12 +35,12 @@ class Own:
     unit: str
 
     def of(self, values: np.ndarray) -> np.ndarray:
-        """Values in SI as the column has them."""
+        """SI values converted to the column's unit."""
         return (values - self.offset) / self.factor
 
 
 def own_units(loaded: Loaded | None) -> dict[str, Own]:
-    """Of columns whose unit is not SI, by column and by what they are of (joint:elbow)."""
+    """Conversions of columns whose unit is not SI, by column and by what they measure (joint:elbow)."""
     out: dict[str, Own] = {}
     if loaded is None:
         return {}
@@ -54,8 +53,8 @@ def own_units(loaded: Loaded | None) -> dict[str, Own]:
 
 @dataclass(frozen=True)
 class Course:
-    """One channel of one log, (n,) at times `t` [s], in its column's own unit: recorded, simulated as the
-    model came and with what was found; NaN where a simulation restarts."""
+    """A channel of a log (n,) at times `t` [s], in its column's unit: recorded, simulated by the original
+    model, and by the corrected one; NaN where a simulation restarts."""
 
     log: str
     channel: str
@@ -64,22 +63,17 @@ class Course:
     recorded: np.ndarray
     simulated: np.ndarray
     corrected: np.ndarray
-    over: float  # mean square that the model as it came leaves, in variances of the noise
+    over: float  # mean square residual of the original model, in noise variances
 
 
 def courses(found: RobotDiagnosis | Changes, own: Mapping[str, Own]) -> list[Course]:
-    """Of every log and channel. A diagnosis' logs are predicted from the others where that was done; of what
-    changed they are run freely from their first sample."""
+    """The courses of all logs and channels. Logs of a diagnosis are predicted from the others if it was
+    cross-validated; for changes, the simulation runs freely from the first sample."""
     rows = found.composed.rows
     if isinstance(found, Changes):
         simulated, corrected = (base_at(found.composed, p).rows for p in (found.old.point, found.point()))
     else:
-        far = found.shrinkage
-        if far is None:
-            before, after = found.plain.residual, found.linear.residual
-        else:
-            before, after = far.plain, far.residual
-        simulated, corrected = rows.observed - before, rows.observed - after
+        simulated, corrected = (rows.observed - left for left in residuals(found))
     out = []
     for log in np.unique(rows.log):
         for c, channel in enumerate(rows.channels):
@@ -101,8 +95,14 @@ def courses(found: RobotDiagnosis | Changes, own: Mapping[str, Own]) -> list[Cou
     return out
 
 
+def residuals(found: RobotDiagnosis) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (N,) before and after correction, held out if the diagnosis was cross-validated."""
+    far = found.shrinkage
+    return (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
+
+
 def next_motion(document: Mapping[str, Any], logs: Iterable[Recording]) -> Recording | None:
-    """The log whose motion the next experiment repeats."""
+    """The log whose motion the next experiment repeats, if any."""
     asked = (document.get("next_experiment") or {}).get("log")
     return next((log for log in logs if log.name == asked), None)
 
@@ -110,8 +110,8 @@ def next_motion(document: Mapping[str, Any], logs: Iterable[Recording]) -> Recor
 def motion_csv(
     log: Recording, commands: Sequence[str], own: Mapping[str, Own], time: tuple[str, float]
 ) -> str:
-    """The commands of a motion as a CSV in the columns' own units, to be run again; `time`: the name of the
-    times' column and its unit [s]. They have been run before, so that they lie within the joints' limits."""
+    """The commands of a motion as CSV in the columns' own units, to be run again; `time` is the name of the
+    time column and its unit [s]. As they were run before, they lie within the joints' limits."""
     columns = [(log.t - log.t[0]) / time[1]]
     columns += [own[n].of(log[n]) if n in own else log[n] for n in commands]
     lines = [",".join((time[0], *commands))]
@@ -120,8 +120,8 @@ def motion_csv(
 
 
 def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Every parameter that a diagnosis tells, by name: what was calibrated, over it what was named; of the
-    members of a set nothing is told."""
+    """Every parameter of a diagnosis by name: the calibrated ones, overridden by those of the named causes.
+    The values of a set's members are null."""
     keys = ("mean", "sd", "interval_90", "unit")
     known = (document.get("calibrated") or {}).get("parameters") or {}
     out = {name: {k: p.get(k) for k in keys} for name, p in known.items()}
@@ -134,10 +134,10 @@ def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def history(path: Path) -> list[dict[str, Any]]:
-    """The runs that a file keeps, a line of JSON each; none where there is no file.
+    """The runs in a history file, one line of JSON each; none if there is no file.
 
     Raises:
-        InputError: a line is none of a history.
+        InputError: A line is not a run.
     """
     if not path.exists():
         return []
@@ -155,7 +155,7 @@ def history(path: Path) -> list[dict[str, Any]]:
 
 
 def _is_run(entry: Any) -> bool:
-    """Whether a history's line names a date, and of each parameter a mean and an interval, or null."""
+    """Whether a line has a date, and for each parameter a mean and an interval, or null."""
     if not (isinstance(entry, dict) and isinstance(entry.get("date"), str)):
         return False
     known = entry.get("parameters")
@@ -171,9 +171,9 @@ def _is_run(entry: Any) -> bool:
 def compared(
     past: Sequence[Mapping[str, Any]], now: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """Of each parameter of a run whether it moved since it was known last: `moved` where the two differ by
-    more than both intervals allow, Bonferroni over all of them; `within` where it lies in the interval of
-    then; else `cannot tell`, as where logs tell nothing of it. What was never known before is left out."""
+    """Compare each parameter of a run with its last known value: `moved` if they differ by more than both
+    intervals allow (Bonferroni over all parameters), `within` if it lies in the old interval, else `cannot
+    tell`, also if unknown now. Parameters never known before are left out."""
     out = {}
     reach = norm.isf((1 - CERTAIN) / 2 / max(len(now), 1))
     for name, p in now.items():
@@ -194,7 +194,7 @@ def compared(
 
 
 def write_rerun(path: Path, found: Sequence[Course]) -> None:
-    """Recorded, simulated and corrected courses of all logs and channels, for Rerun's viewer.
+    """Write recorded, simulated and corrected courses of all logs and channels for Rerun's viewer.
 
     Raises:
         InputError: rerun-sdk is not installed.

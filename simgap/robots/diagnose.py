@@ -1,7 +1,7 @@
-"""The diagnosis of a robot's logs against any simulator of it, from logs to verdict.
+"""The diagnosis of a robot's logs against any simulator of it.
 
-Noise and windows, calibration of what nobody measured, search over sets of causes, how far the gap shrinks on
-logs that took no part, verdict, next experiment; `describe` makes the document.
+Noise and windows, calibration of what nobody measured, search over sets of causes, shrinkage of the gap on
+held-out logs, verdict, next experiment. `describe` makes the JSON document.
 """
 
 from __future__ import annotations
@@ -15,30 +15,33 @@ from simgap.progress import Progress, silent
 from simgap.robot_effects import STATED, UNMEASURED, doubted, effects_of
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration, calibrate
-from simgap.robots.heldout import Shrinkage, shrinkage
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed, Point
-from simgap.robots.phases import Phases, phases_of
-from simgap.robots.rows import folds_of, noises
-from simgap.robots.search import Search, Settled
+from simgap.robots.rows import Phases, folds_of, noises, phases_of
+from simgap.robots.search import FittedSet, Search
 from simgap.robots.sets import Identifiability
-from simgap.robots.verdict import RobotVerdict, next_log, verdict_on
+from simgap.robots.verdict import RobotVerdict, Shrinkage, next_log, shrinkage, verdict_on
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-STAGES = 14  # look: what a progress bar counts at most
+STAGES = 14  # look: stages that a progress bar counts at most
 
 
 @dataclass(frozen=True)
 class RobotDiagnosis:
-    """All that was found. `plain` is the gap as the simulator comes (what is fitted along, at its best),
-    `linear` where the best set acts; `search` has all sets that were fitted; `calibrated`: the model with
-    what nobody measured fitted, where there is such."""
+    """All that was found.
+
+    `composed`: the model along the windows that were compared; `phases`: stretches of the logs by name;
+    `search`: all sets that were fitted; `best`: the best of them; `verdict`: the verdict; `shrinkage`: of the
+    gap on held-out logs; None without causes; `identifiable`: which candidates' parameters the logs tell
+    apart; `next_log`: the next experiment; `calibrated`: the model with what nobody measured fitted, where
+    there is such; `warnings`: one line each.
+    """
 
     composed: Composed
     phases: Phases
     search: Search
-    best: Settled
+    best: FittedSet
     verdict: RobotVerdict
     shrinkage: Shrinkage | None
     identifiable: Identifiability
@@ -48,12 +51,12 @@ class RobotDiagnosis:
 
     @property
     def plain(self) -> Linear:
-        """The gap as the simulator comes."""
-        return self.search.known[frozenset()].linear
+        """The gap of the simulator as it comes, with what is fitted along at its best."""
+        return self.search.fitted[frozenset()].linear
 
     @property
     def linear(self) -> Linear:
-        """The gap where the best set acts."""
+        """The gap with the best set acting."""
         return self.best.linear
 
 
@@ -73,19 +76,19 @@ def diagnose(
     """Diagnose logs against a simulator.
 
     Args:
-        simulator: the robot's model.
-        recordings: its logs.
-        forced: effects that are taken instead of choosing.
-        seed: of what is drawn.
-        phases: stretches of the logs by name; by motion and contact where they are not given.
-        tell: called with a description of each stage.
-        warn: called at once with what cannot be separated.
-        more: further candidates.
-        length: s of windows.
-        groups: one number a log; logs of one number are held out together.
+        simulator: The robot's model.
+        recordings: Its logs.
+        forced: Effects that are given instead of chosen.
+        seed: Of random draws.
+        phases: Stretches of the logs by name; by motion and contact by default.
+        tell: Called with a description of each stage.
+        warn: Called at once with each warning.
+        more: Further candidates.
+        length: Length of the windows [s].
+        groups: A number for each log; logs of the same number are held out together.
 
     Raises:
-        InputError: input is at fault, or the simulator diverges.
+        InputError: Input is at fault, or the simulator diverges.
     """
     if groups is not None and (len(groups) != len(recordings) or len({*groups}) < 2):
         counted = f"{len(groups)} in {len({*groups})} groups for {len(recordings)} logs"
@@ -99,7 +102,7 @@ def diagnose(
     given = {} if length is None else {"length": length}
 
     def calibrated(patterns: Sequence[str], begin: Point | None = None) -> Calibration | None:
-        """With what models state or lack and nobody measured fitted; None where there is nothing of it."""
+        """Fit what models state or lack and nobody measured; None where there is nothing of it."""
         wide = doubted(effects, patterns, getattr(simulator, "sd", {}))
         if not any(e.fitted and not e.numeric for e in wide.values()):
             return None
@@ -107,8 +110,8 @@ def diagnose(
 
     whole = Composed.of(simulator, recordings, effects, noise, **given)
     parts = phases_of(simulator, recordings, whole.windows) if phases is None else phases
-    # What strikes or slides goes its own way from the smallest error of its start: what flight and rest tell
-    # is not to be outvoted by it, and what it tells is asked where those tell nothing.
+    # Impacts and sliding amplify the smallest error of a start. They must not outvote flight and rest, and
+    # are asked only where those show no cause.
     every = [whole] if forced or (calm := whole.calm()) is whole else [calm, whole]
     for composed in every:
         found = _diagnosed(
@@ -129,7 +132,7 @@ def _diagnosed(
     warn: Progress,
     groups: Sequence[int] | None,
 ) -> RobotDiagnosis:
-    """The diagnosis of some of the windows."""
+    """The diagnosis along some of the windows."""
     warnings: list[str] = []
 
     def said(text: str) -> None:
@@ -140,7 +143,7 @@ def _diagnosed(
     fold = folds_of(composed.rows, len(composed.recordings), groups)
     search = Search(composed, wanted, fold, lambda: calibrated(UNMEASURED))
     best = search.forced(tuple(forced)) if forced else search.run(tell)
-    nothing = search.known[frozenset()]
+    nothing = search.fitted[frozenset()]
     for name in search.diverged:
         said(f"{name}: the simulator diverges with it, and it is left out")
     if nothing.linear.dropped:

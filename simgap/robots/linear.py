@@ -1,7 +1,7 @@
-"""Residuals and sensitivities of all windows, in the channels' units: how effects and starts move rows.
+"""Residuals and sensitivities of all windows, in the channels' units: how effects and starts move the rows.
 
-Effects that kink at their neutral value (friction, dead bands) are taken where they act: their shift from
-neutral to `at` is a rollout of its own, their derivative a forward difference there.
+Effects that kink at their neutral value (friction, dead bands) are linearised where they act: the shift from
+neutral to there is a rollout of its own, the derivative a forward difference.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from simgap.robots.rows import Rows
 from simgap.robots.windows import JUMPS, REGIMES, STRIKES, earlier
 from simgap.simulators.protocol import Channels
 
-STEP = 0.05  # numerics: of a parameter's standard deviation: the finite difference
-HUGE = 1e100  # numerics: units, beyond which a simulation counts as diverged: squares must add up
-START_STEP = 0.3  # numerics: of a start's
+STEP = 0.05  # numerics: of a parameter's sd: the usual finite difference
+HUGE = 1e100  # numerics: units; beyond it a simulation counts as diverged, for squares must add up
+START_STEP = 0.3  # numerics: of a start's sd: the finite difference
 
 
 @dataclass(frozen=True)
 class Moved:
-    """How an effect moves rows: `shift` (N,) from neutral to `at` (k,), and its derivatives there (N, k)."""
+    """How an effect moves the rows: their `shift` (N,) from neutral to the values `at` (k,), and the
+    derivatives there (N, k)."""
 
     at: np.ndarray
     shift: np.ndarray
@@ -34,8 +35,13 @@ class Moved:
 
 @dataclass(frozen=True)
 class Linear:
-    """The gap about a point: `residual` (N,), recorded less simulated, by effect how it moves the rows, by
-    state (N,) how the windows' starts do. `diverged` are effects whose rollouts were not finite."""
+    """The gap linearised about a point.
+
+    `point`: the point; `rows`: the rows that are compared; `residual`: recorded less simulated values (N,);
+    NaN where a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's
+    start; `moved`: how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number
+    of windows whose rollout diverged; `rates`: rates (N,) of the simulated channels.
+    """
 
     point: Point
     rows: Rows
@@ -45,16 +51,16 @@ class Linear:
     diverged: tuple[str, ...]
     dropped: int  # windows whose rollout was not finite
     rates: np.ndarray  # (N,) the simulated channel's rate
-    wobble: np.ndarray | None  # (N, K) as in `Composed`
 
     def with_moved(self, more: Mapping[str, Moved], diverged: Sequence[str] = ()) -> Linear:
-        """With some effects' columns added or replaced."""
+        """The same with columns of effects added or replaced."""
         return replace(self, moved={**self.moved, **more}, diverged=(*self.diverged, *diverged))
 
 
 @dataclass(frozen=True)
 class Base:
-    """Rollouts at a point, from which effects are varied: starts, true channels, as read, and their rows."""
+    """Rollouts at a point, from which effects are varied: starts, channels before (`true`) and after (`read`)
+    read-out effects, and rows (N,)."""
 
     point: Point
     begun: list
@@ -64,7 +70,7 @@ class Base:
 
 
 def base_at(composed: Composed, point: Point) -> Base:
-    """Rollouts of all windows at a point."""
+    """Roll out all windows at a point."""
     begun = composed.starts(point)
     true = composed.rolled(point, begun)
     read = composed.read(true, point)
@@ -74,10 +80,16 @@ def base_at(composed: Composed, point: Point) -> Base:
 def linearise(
     composed: Composed, point: Point, effects: Sequence[str], starts: Mapping[str, np.ndarray] | None = None
 ) -> Linear:
-    """Residuals at a point, sensitivities to `starts` unless they are given, and to the parameters of these
-    effects.
+    """Residuals and sensitivities at a point.
 
-    InputError where the simulator diverges in every window.
+    Args:
+        composed: The model along its windows.
+        point: The point.
+        effects: Names of the effects by whose parameters derivatives are taken.
+        starts: Derivatives by the starts, if already known.
+
+    Raises:
+        InputError: The simulator diverges in every window.
     """
     base = base_at(composed, point)
     if all(channels is None for channels in base.read):
@@ -85,8 +97,7 @@ def linearise(
     residual = composed.rows.observed - base.rows
     starts = _by_start(composed, base) if starts is None else starts
     dropped = sum(channels is None for channels in base.read)
-    rates, wobble = _rates(composed, base), composed.wobble
-    found = Linear(point, composed.rows, residual, starts, {}, (), dropped, rates, wobble)
+    found = Linear(point, composed.rows, residual, starts, {}, (), dropped, _rates(composed, base))
     moved, diverged = {}, []
     for number, name in enumerate(effects):
         say(f"{number + 1} of {len(effects)}, {name}")
@@ -117,10 +128,22 @@ def vary(
     step: np.ndarray | None = None,
     shifted: bool = True,
 ) -> Moved | None:
-    """How an effect moves the rows from the base; None where it diverges. Where the base's point has it
-    act, or `at` is None, about the point itself; else about `at`, reached from neutral. `step` (k,): finite
-    differences of its parameters, in usual sizes. `shifted`: whether the way from neutral to a point that has
-    it act is wanted; it is of no use for what is fitted along."""
+    """How an effect moves the rows, by rollouts.
+
+    Args:
+        composed: The model along its windows.
+        base: Rollouts without a change.
+        starts: Derivatives by the starts.
+        name: The effect.
+        at: Where it is linearised, reached from neutral, if the base's point does not have it act; the point
+            itself by default.
+        step: Finite differences (k,) of its parameters, in usual sizes.
+        shifted: Whether the shift from neutral is wanted where the effect acts; what is fitted along has
+            none.
+
+    Returns:
+        Shift and derivatives; None where a rollout diverged.
+    """
     effect = composed.effects[name]
     neutral = effect.neutral()
     now = {**neutral, **base.point.get(name, {})}
@@ -142,18 +165,18 @@ def vary(
     point = np.array([here[n] for n in effect.parameters])
     if name in base.point and shifted and not effect.fitted:
         shift = base.rows - _rows_at(composed, base, starts, name, neutral)
-        if not _bounded(shift[fine]):  # a straight line back, where nothing else leads there
+        if not _bounded(shift[fine]):  # the straight line back, where neutral itself diverges
             shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
     return Moved(point, shift, jacobian)
 
 
 def _bounded(values: np.ndarray) -> bool:
-    """Whether a simulation stays finite and within what its squares can be told of."""
+    """Whether values are finite and their squares can be summed."""
     return bool((np.abs(values) < HUGE).all())
 
 
-def wobbling(composed: Composed, linear: Linear) -> Composed:
-    """With the wobble of contacts by all effects that were linearised (see `Composed`)."""
+def with_wobble(composed: Composed, linear: Linear) -> Composed:
+    """The model with the wobble of contacts by all effects that were linearised (see `Composed`)."""
     strikes = linear.rows.regime == REGIMES.index(STRIKES)
     if not (linear.starts and strikes.any() and linear.moved):
         return composed
@@ -171,8 +194,11 @@ def _each_log_at_once(
     rows: np.ndarray,
     sizes: np.ndarray,
 ) -> list[np.ndarray]:
-    """Derivatives (N,) by every parameter of an effect that each log has of its own: logs do not act on each
-    other, so one is varied in all of them together. Parameters go by log, then by kind."""
+    """Derivatives (N,) by every parameter of an effect that each log has of its own.
+
+    Logs do not act on each other, so that a parameter is varied in all of them at once. Parameters are
+    ordered by log, then by kind.
+    """
     names = list(composed.effects[name].parameters)
     kinds = len(names) // len(composed.recordings)
     found = []
@@ -188,8 +214,8 @@ def _each_log_at_once(
 def _rows_at(
     composed: Composed, base: Base, starts: Mapping[str, np.ndarray], name: str, values: Mapping[str, float]
 ) -> np.ndarray:
-    """Rows (N,) with one effect at other values. A read-out needs no rollout: starts, which are read through
-    it too, move by their sensitivities."""
+    """Rows (N,) with one effect at other values. A read-out effect needs no rollout: starts, which are read
+    through it, move the rows by their sensitivities."""
     effect = composed.effects[name]
     moved = {**base.point, name: dict(values)}
     if effect.alter is None:
@@ -211,14 +237,14 @@ def _rows_at(
 
 
 def step_of(composed: Composed, effect: str, name: str, value: float, size: float = STEP) -> float:
-    """A finite difference of `size` usual sizes that stays within bounds."""
+    """A finite difference of `size` usual sizes that stays within the parameter's bounds."""
     parameter = composed.effects[effect].parameters[name]
     step = size * parameter.sd
     return step if value + step <= parameter.high else -step
 
 
 def _by_start(composed: Composed, base: Base) -> dict[str, np.ndarray]:
-    """State -> derivative (N,) of the rows by each window's start."""
+    """Derivatives (N,) of the rows by each state of their window's start."""
     out = {}
     for state in dict.fromkeys(n for w in composed.windows for n in w.doubt):
         steps = [START_STEP * w.doubt.get(state, 0.0) for w in composed.windows]

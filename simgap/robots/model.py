@@ -1,4 +1,4 @@
-"""Effects around a simulator: the channels of all windows for any values of all effects' parameters."""
+"""A simulator with effects around it: the channels of all windows at any values of their parameters."""
 
 from __future__ import annotations
 
@@ -14,22 +14,27 @@ from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
 
-# numerics: windows of a regime from which on a search takes some of them alone
+# numerics: windows of a regime; of more a search uses every second, third, ..
 FIRST = 48
-SETTLE = 0.2  # numerics: s that a model has to come to rest where a window is of rest
+SETTLE = 0.2  # numerics: s for a model to come to rest before a window of rest
 
-Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; what is not named is neutral
+Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; neutral where absent
 
 
 @dataclass(frozen=True)
 class Composed:
     """A simulator with effects around it, along the windows of recordings.
 
-    `wobble` (N, K): by how much every effect of its usual size moves the rows of windows in which bodies
-    move in contact; None where there is none. `motion`: a number for every log's motion, the same in repeats
-    (see `motions`); none where windows begin anew from states of their own. How rows move with the
-    simulator's own numbers (its step, how it holds commands) hardly depends on where: that is taken as it is
-    at the point `about`, and what would cost another run (a finer step) is in proportion to it.
+    Derivatives by the simulator's own numbers (its step, how it holds commands) hardly depend on the other
+    parameters: they are taken once, at the point `about`, and what would cost a second run (a finer step) is
+    linear in its parameter.
+
+    `simulator`: the robot's model; `recordings`: its logs; `windows`: stretches of the logs, each simulated
+    from its own start; `effects`: candidates and what is fitted along, by name; `noise`: standard deviation
+    of one sample by channel [its unit]; `rows`: the rows that the windows give; `wobble`: change (N, K) of
+    the rows by a usual size of every effect, in windows in which bodies move in contact; None without such
+    windows; `motion`: A number for every log's motion, equal in repeats (see `motions`); empty where windows
+    restart from states of their own; `about`: the point of those derivatives.
     """
 
     simulator: Simulator
@@ -52,25 +57,21 @@ class Composed:
         noise: Mapping[str, float],
         length: float = LENGTH,
     ) -> Composed:
-        """With windows of about `length` [s] cut, and their rows laid out."""
+        """Cut windows of about `length` [s] and lay out their rows."""
         windows = tuple(cut(simulator, recordings, noise, length))
         rows = rows_of(recordings, windows, noise)
         motion = () if restarts(simulator) else tuple(motions(simulator, recordings))
         return cls(simulator, tuple(recordings), windows, effects, noise, rows, motion=motion)
 
-    def along(self, logs: Sequence[int]) -> Composed:
-        """The same along some of the logs alone, which keep their numbers."""
-        return self.among([k for k, w in enumerate(self.windows) if w.log in logs])
-
     def calm(self) -> Composed:
-        """The same in flight and at rest alone, where there are such windows; else this."""
+        """The same without windows of bodies that move in contact, unless there are no others."""
         kept = [k for k, w in enumerate(self.windows) if w.regime != STRIKES]
         if not kept or len(kept) == len(self.windows):
             return self
         return replace(self.among(kept), wobble=None)
 
     def among(self, numbers: Sequence[int]) -> Composed:
-        """The same in some of the windows alone, by number, ascending."""
+        """The same in some of the windows, by number, ascending."""
         windows = tuple(self.windows[k] for k in numbers)
         wobble = None if self.wobble is None else self.wobble[np.isin(self.rows.window, numbers)]
         return replace(
@@ -78,14 +79,14 @@ class Composed:
         )
 
     def repeats(self) -> list[int]:
-        """In how many of these logs each window's motion is made."""
+        """The number of these logs that repeat each window's motion."""
         if not self.motion:
             return [1] * len(self.windows)
         made = [self.motion[log] for log in {w.log for w in self.windows}]
         return [made.count(self.motion[w.log]) for w in self.windows]
 
     def thinned(self) -> list[int]:
-        """Numbers of windows that a search takes: of every regime evenly chosen ones, FIRST at least."""
+        """Numbers of the windows that a search uses: evenly chosen ones of every regime, FIRST or more."""
         if any(w.start is None for w in self.windows):
             return [*range(len(self.windows))]
         kept: list[int] = []
@@ -95,7 +96,7 @@ class Composed:
         return sorted(kept)
 
     def commanded(self, point: Point) -> list[Recording]:
-        """The recordings with commands as the drives took them."""
+        """The recordings with commands as the drives carried them out."""
         out = list(self.recordings)
         for name, theta in point.items():
             act = self.effects[name].command
@@ -113,11 +114,19 @@ class Composed:
         return out
 
     def moved(self, point: Point) -> Composed:
-        """The same, with what the simulator's own numbers do as it is at this point."""
+        """The same with the derivatives by the simulator's own numbers taken at this point."""
         return replace(self, about=dict(point), _slopes={})
 
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
-        """True channels of every window from these starts; None where a rollout diverged."""
+        """Roll out every window.
+
+        Args:
+            point: Parameters of the effects.
+            starts: Start of each window, by state.
+
+        Returns:
+            True channels of every window, before read-out effects; None where a rollout diverged.
+        """
         out = self._rolled(self._without_dear(point), self.windows, starts)
         for name, theta in point.items():
             if self.effects[name].dear:
@@ -132,13 +141,14 @@ class Composed:
     def stepped(
         self, true: Sequence[Channels | None], name: str, short: str, by: float
     ) -> list[Channels | None]:
-        """True channels with one of the simulator's own numbers changed by so much."""
+        """True channels with one of the simulator's own numbers changed by `by`."""
         return (
             [_sum(a, b, by) for a, b in zip(true, self._slope(name, short), strict=True)] if by else [*true]
         )
 
     def _slope(self, name: str, short: str) -> list[Channels]:
-        """Derivatives of every window's channels by a number of the simulator's, none where one diverges."""
+        """Derivatives of every window's true channels by one of the simulator's own numbers; empty where it
+        diverged."""
         keys = [(w.log, w.begin, w.end, name, short) for w in self.windows]
         new = [w for w, key in zip(self.windows, keys, strict=True) if key not in self._slopes]
         if new:
@@ -157,13 +167,13 @@ class Composed:
     def _rolled(
         self, point: Point, windows: Sequence[Window], starts: Sequence[Mapping[str, float] | None]
     ) -> list[Channels | None]:
-        """True channels of windows, all as the simulator gives them."""
+        """True channels of windows, all from the simulator itself."""
         recordings, parameters = self.commanded(point), self.parameters(point)
         jobs, leads = [], []
         for window, start in zip(windows, starts, strict=True):
             along, lead = recordings[window.log].window(window.begin, window.end), 0
             if window.regime == RESTS:
-                along, lead = settled(along)
+                along, lead = preceded_by_rest(along)
             jobs.append(Job(parameters, along, start))
             leads.append(lead)
         return [
@@ -172,7 +182,7 @@ class Composed:
         ]
 
     def read(self, true: Sequence[Channels | None], point: Point) -> list[Channels | None]:
-        """Channels of every window as they are read."""
+        """Channels of every window as the sensors report them."""
         acting = [(e.alter, v) for e, v in self._acting(point) if e.alter is not None]
         out: list[Channels | None] = []
         for window, channels in zip(self.windows, true, strict=True):
@@ -186,11 +196,11 @@ class Composed:
         return out
 
     def starts(self, point: Point) -> list[Mapping[str, float] | None]:
-        """Every window's start, smoothed from the recordings with read-outs' effects undone."""
+        """Every window's start, smoothed from the recordings with read-out effects undone."""
         undone = self.unread(point)
         if undone is None:
             return [w.start for w in self.windows]
-        # A start is read column by column, and what is not undone is read as it was.
+        # A start is read column by column; only changed columns are read again.
         changed = [
             {n for n, v in new.columns.items() if v is not old.columns.get(n)}
             for old, new in zip(self.recordings, undone, strict=True)
@@ -206,7 +216,7 @@ class Composed:
         return out
 
     def unread(self, point: Point) -> list[Recording] | None:
-        """The recordings with read-outs' effects undone, None where none acts."""
+        """The recordings with read-out effects undone; None where none acts."""
         acting = [(e.restore, v) for e, v in self._acting(point) if e.restore is not None]
         if not acting:
             return None
@@ -220,13 +230,17 @@ class Composed:
 
 
 def _sum(one: Channels | None, other: Channels, by: float) -> Channels | None:
-    """One and so much of another, channel by channel."""
+    """One plus `by` times the other, channel by channel."""
     return one if one is None or not other else {n: v + by * other[n] for n, v in one.items()}
 
 
-def settled(window: Recording) -> tuple[Recording, int]:
-    """A window with SETTLE before it in which all is as at its first sample, and how many samples that is:
-    the model is to lie where it would lie itself, and not on its way there."""
+def preceded_by_rest(window: Recording) -> tuple[Recording, int]:
+    """Prepend SETTLE to a window, constant as at its first sample, so that the model comes to rest where it
+    would rest itself.
+
+    Returns:
+        The longer window, and the number of samples prepended.
+    """
     step = float(np.median(np.diff(window.t)))
     lead = max(1, round(SETTLE / step))
     t = np.concatenate([window.t[0] - step * np.arange(lead, 0, -1), window.t])
@@ -234,15 +248,15 @@ def settled(window: Recording) -> tuple[Recording, int]:
     return Recording(window.name, t, columns, window.first), lead
 
 
-# A model's error is the same each time the same motion is made: twelve repeats tell of it what one does, and
-# only of the sensors' noise twelve times as much.
+# A model's error is the same in every repeat of a motion: twelve repeats say as much of it as one, and twelve
+# times as much of the sensors' noise alone.
 
-ALIKE = 0.1  # chosen: of a command's usual size; logs whose commands are closer than this are of one motion
+ALIKE = 0.1  # chosen: share of a command's usual size; logs with commands closer than this repeat a motion
 
 
 def motions(simulator: Simulator, recordings: Sequence[Recording]) -> list[int]:
-    """A number for every log's motion: the same where its commands are the same. Without commands each log is
-    a motion of its own."""
+    """A number for every log's motion, equal where the commands are alike; without commands every log is its
+    own."""
     names = [n for n, c in simulator.channels.items() if c.kind == "command"]
     every = {n: np.concatenate([log[n] for log in recordings]) for n in names}
     size = {n: max(float(np.std(v) + abs(np.mean(v))), 1e-300) for n, v in every.items()}

@@ -1,11 +1,11 @@
-"""Which effects act: sets proposed in closed form about a point, fitted exactly, proposed anew where the best
-is.
+"""The search for the effects that act: proposals in closed form about a point, then exact fits.
 
-About the point of the best set so far every candidate is rolled out once; sets near it (one more, one less,
-one exchanged, two more) are ranked by their evidence in closed form, and those that lead are fitted exactly,
-each with the discrepancy that it leaves. When none is better, every cause in turn is taken out, and what
-could take its place is proposed about the point without it: a straight line from where one hysteresis acts to
-where another would is no measure of either. What was fitted exactly on the way makes the posterior over sets.
+About the point of the best set so far every candidate is rolled out once. Sets near it (one effect more, one
+less, one exchanged, two more) are ranked by their evidence in closed form, and the leading ones are fitted
+exactly, each with the discrepancy that it leaves. When none is better, every cause is taken out in turn, and
+replacements are proposed about the point without it, because a straight line from where one hysteresis acts
+to where another would act says nothing of either. All sets that were fitted exactly on the way make the
+posterior over sets.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from scipy.stats import t as student
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration
-from simgap.robots.fit import moved_to, prior_cost
-from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, wobbling
+from simgap.robots.fit import fit_effects, prior_cost
+from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, with_wobble
 from simgap.robots.model import Composed, Point
 from simgap.robots.sets import (
     Identifiability,
@@ -40,28 +40,34 @@ from simgap.robots.windows import STRIKES
 from simgap.simulators.protocol import Parameter
 
 EXPECTED = 1.0  # prior: how many of all candidates act
-LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: of the discrepancy, that sets are judged by
+LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which sets are scored
 TRIED = 4  # numerics: sets that are fitted exactly about one point
-LEARNED = 2  # numerics: of these, what tells how far straight lines are off of what takes a cause's place
+LEARNED = 2  # numerics: of these, how many teach by how much proposals of replacements are wrong
 LEADERS = 16  # numerics: candidates that are rolled out where they fit best
-USUAL = 1.0  # numerics: usual sizes of what does not act yet, whose secant is taken
-LEAVES = 2.0  # numerics: squares over the noise's, from which a search begins from the calibration, too
+USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
+LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
 JOINED = " against "
-NEAR = 10.0  # numerics: nats by which straight lines may be wrong of what takes a cause's place
+NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
-BETTER = 2.0  # numerics: nats by which a set must be better to be gone on with
+BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
-ROUNDS = 12  # numerics: of an iteration that settles sooner
-BY_CHANCE = 0.05  # chosen: of sets that predict held-out folds no better, those that may be said to
-MANY = 80  # numerics: candidates of which all pairs are tried
+ROUNDS = 12  # numerics: most steps of a search
+BY_CHANCE = 0.05  # chosen: of sets that predict held-out folds no better, the share that may be said to
+MANY = 80  # numerics: candidates up to which all pairs are tried
 
 
-@dataclass(frozen=True)
-class Settled:
-    """A set where it fits best: its point, the gap linear about it in its own effects, the discrepancy that
-    it leaves, its log evidence, and what straight lines from there promise; `composed`: with what the
-    simulator's own numbers do as it is there."""
+@dataclass(frozen=True, eq=False)
+class FittedSet:
+    """A set of effects at its best fit.
+
+    `composed`: the model, with the derivatives by the simulator's own numbers taken at the fit; `names`: the
+    set; `point`: its parameters, and those of what is fitted along; `linear`: the gap linearised about the
+    point, in the set's effects; `covariances`: of the rows; `discrepancy`: what the set leaves beyond noise;
+    `wide`: windows that are off for reasons of their own, with the factor of their variance; `whiten`: by
+    noise, discrepancy and wide windows; `sets`: the closed form about the point; `score`: log evidence
+    [nats]; `promise`: log evidence [nats] that the closed form expects of a further step.
+    """
 
     composed: Composed
     names: Names
@@ -77,42 +83,48 @@ class Settled:
 
     @cached_property
     def squares(self) -> np.ndarray:
-        """Squares (N,) of what is left, whitened by the sensors' noise and the starts alone."""
+        """Squares (N,) of the residual, whitened by the sensors' noise and the uncertain starts alone."""
         return self.covariances.whitener()(np.nan_to_num(self.linear.residual)) ** 2
 
     @cached_property
     def fine(self) -> np.ndarray:
-        """Rows (N,) of windows that did not diverge, and are not off for reasons of their own."""
+        """Rows (N,) of windows that neither diverged nor are off for reasons of their own."""
         return np.isfinite(self.linear.residual) & ~np.isin(self.linear.rows.window, list(self.wide))
 
     @cached_property
     def noise(self) -> float:
-        """The mean square of a row if there is noise alone."""
+        """The expected mean square of a row under noise alone."""
         return self.covariances.floor() / max(int(np.isfinite(self.linear.residual).sum()), 1)
 
 
 @dataclass
 class Search:
-    """Sets of candidates along windows; `fold` (N,) of each row. `known`: sets that were fitted, each at its
-    best; `calibrated` fits what nobody measured, from the model as it comes, for where a search from there
-    leaves a gap; `calibration`: what it found."""
+    """A search over sets of candidates.
+
+    `composed`: the model along the windows that are compared; `wanted`: names of the candidates; `fold`: fold
+    (N,) of each row; `calibrated`: fits what nobody measured, from the model as it comes; called where a gap
+    is left; `calibration`: its result; `fitted`: all fitted sets, each at its best; `against`: joint
+    candidates (see `_joint`): how much of the second goes against one of the first; `columns`: candidates
+    as they were rolled out where the search began; None of one that diverged; `identifiable`: which
+    candidates' parameters the logs tell apart; `diverged`: candidates that diverge.
+    """
 
     composed: Composed
     wanted: Names
     fold: np.ndarray
     calibrated: Callable[[], Calibration | None] = lambda: None
     calibration: Calibration | None = None
-    known: dict[frozenset[str], Settled] = field(default_factory=dict)
-    starts: dict = field(default_factory=dict)
+    fitted: dict[frozenset[str], FittedSet] = field(default_factory=dict)
     against: dict[str, float] = field(default_factory=dict)
-    columns: dict[str, Moved | None] = field(default_factory=dict)  # of candidates where a search began
+    columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
-    _densities: dict = field(default_factory=dict, repr=False)
+    _starts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    _densities: dict[tuple[FittedSet, Whitener], np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def along(self) -> Names:
-        """Effects that are fitted along with every cause."""
+        """Effects that are fitted along with every set."""
         return tuple(n for n, e in self.composed.effects.items() if e.fitted)
 
     @property
@@ -121,110 +133,116 @@ class Search:
         share = min(EXPECTED / max(len(self.wanted), 1), 0.5)
         return float(np.log(share / (1 - share)))
 
-    def run(self, tell: Progress) -> Settled:
-        """The best set: from nothing on, and where that leaves more than calibration does, from there
-        back."""
+    def run(self, tell: Progress) -> FittedSet:
+        """The best set, searched forwards from nothing and, where that leaves a gap, backwards from the
+        calibration."""
         best = self._from(self.nothing(), tell)
         if best.squares[best.fine].mean() < LEAVES * best.noise:
             return best
         tell("from the calibration")
         self.columns.clear()
-        other = self._calibrated()
+        other = self._from_calibration()
         if other is not None and other.squares.sum() < best.squares.sum():
             other = self._from(other, tell)
             best = other if self._is_better(other, best) else best
         return best
 
-    def _from(self, best: Settled, tell: Progress) -> Settled:
+    def forced(self, names: Names) -> FittedSet:
+        """A given set at its best; all sets with one effect less are fitted, too."""
+        sets, levels = self.propose(self.nothing(), self.wanted)
+        _, level, begin = self._likeliest(sets, names)
+        found = self.fit(names, begin, [levels[level]])
+        for out in names if len(names) > 1 else ():
+            rest = tuple(n for n in names if n != out)
+            self.fit(rest, without(found.point, out), [found.whiten])
+        return found
+
+    def nothing(self) -> FittedSet:
+        """The empty set: only what is fitted along."""
+        point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
+        if any(w.regime == STRIKES for w in self.composed.windows):
+            every = linearise(self.composed, point, [*self.along, *self.wanted])
+            self.composed = with_wobble(self.composed, every)
+        linear = linearise(self.composed.moved(point), point, self.along)
+        self._starts = dict(linear.starts)
+        return self.fit((), point, [covariances(self.composed, linear).whitener()])
+
+    def _from(self, best: FittedSet, tell: Progress) -> FittedSet:
         """The best set that steps lead to."""
         for number in range(ROUNDS):
             tell(f"round {number + 1}: {' + '.join(best.names) or 'nothing'}")
-            better = self._better(best, best) or self._exchanged(best)
+            better = self._find_better(best, best) or self._exchange(best)
             if better is None:
                 break
             best = better if number else self._from_other_ends(better)
         return best
 
-    def _from_other_ends(self, best: Settled) -> Settled:
-        """The same set from the other ends of how the simulator takes its commands, where straight lines from
-        there promise more: commands in steps are nearly those in lines that come later, and no small step
-        leads from one to the other."""
+    def _from_other_ends(self, best: FittedSet) -> FittedSet:
+        """The same set from the other end of how the simulator takes its commands, where that promises more.
+
+        Commands held in steps are nearly commands in lines that come later, and no small step leads from one
+        to the other.
+        """
         effects = self.composed.effects
         for name in (n for n in self.along if effects[n].numeric and not effects[n].dear):
-            for short, known in effects[name].parameters.items():
-                if np.isfinite([known.low, known.high]).all():
-                    near_low = best.point[name][short] < 0.5 * (known.low + known.high)
-                    other = {**best.point[name], short: known.high if near_low else known.low}
+            for short, p in effects[name].parameters.items():
+                if np.isfinite([p.low, p.high]).all():
+                    near_low = best.point[name][short] < 0.5 * (p.low + p.high)
+                    other = {**best.point[name], short: p.high if near_low else p.low}
                     point = {**best.point, name: other}
                     there = replace(best, composed=best.composed.moved(point), point=point)
-                    sets, levels = self.place(there, best.names)
+                    sets, levels = self.propose(there, best.names)
                     score, k, begin = self._likeliest(sets, best.names)
                     if score > best.score + NEAR:
-                        best = self.settled(best.names, begin, [levels[k]], best.score)
+                        best = self.fit(best.names, begin, [levels[k]], best.score)
         return best
 
-    def _calibrated(self) -> Settled | None:
-        """Of what calibration moved as much as is needed: taken back one by one where the whole acts, in
-        closed form."""
+    def _from_calibration(self) -> FittedSet | None:
+        """The set of what calibration moved, less what it can do without in closed form."""
         self.calibration = self.calibrated()
         calibrated = {} if self.calibration is None else self.calibration.point
-        moved = {n: v for n, v in calibrated.items() if n in self.wanted and self._off(n, v)}
+        moved = {n: v for n, v in calibrated.items() if n in self.wanted and self._is_moved(n, v)}
         if not moved:
             return None
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
-        whole = self.settled(names, begin, [self.known[frozenset()].covariances.whitener()])
-        sets, _ = self.place(whole, names)
+        whole = self.fit(names, begin, [self.fitted[frozenset()].covariances.whitener()])
+        sets, _ = self.propose(whole, names)
         names = sets.pruned(names, self._likeliest(sets, names)[1])
-        return self.settled(names, self._likeliest(sets, names)[2], [whole.whiten])
+        return self.fit(names, self._likeliest(sets, names)[2], [whole.whiten])
 
-    def _off(self, name: str, values: Mapping[str, float]) -> bool:
-        known = self.composed.effects[name].parameters
-        return any(abs(v - known[n].nominal) > SMALL * known[n].sd for n, v in values.items())
-
-    def forced(self, names: Names) -> Settled:
-        """A given set at its best, and those with one less."""
-        nothing = self.nothing()
-        sets, levels = self.place(nothing, self.wanted)
-        _, level, begin = self._likeliest(sets, names)
-        found = self.settled(names, begin, [levels[level]])
-        for out in names if len(names) > 1 else ():
-            rest = tuple(n for n in names if n != out)
-            self.settled(rest, without(found.point, out), [found.whiten])
-        return found
+    def _is_moved(self, name: str, values: Mapping[str, float]) -> bool:
+        parameters = self.composed.effects[name].parameters
+        return any(abs(parameters[n].coordinate(v)) > SMALL for n, v in values.items())
 
     def _likeliest(self, sets: Sets, names: Names) -> tuple[float, int, Point]:
-        """The score of a set in closed form, by the level that it is likeliest by, and where it has it."""
+        """A set's highest score in closed form, the level that gives it, and the point there."""
         score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(sets.gram)))
         return score, level, point_of(self.composed.effects, sets.fit(names, level), names, self.along)
 
-    def nothing(self) -> Settled:
-        """What is fitted along, alone; the simulator's own numbers are straight lines about where they are
-        then."""
-        point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
-        if any(w.regime == STRIKES for w in self.composed.windows):
-            every = linearise(self.composed, point, [*self.along, *self.wanted])
-            self.composed = wobbling(self.composed, every)
-        linear = linearise(self.composed.moved(point), point, self.along)
-        self.starts = dict(linear.starts)
-        return self.settled((), point, [covariances(self.composed, linear).whitener()])
-
-    def settled(
+    def fit(
         self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
-    ) -> Settled:
-        """A set at its best, from a start: whitened by the first of some scales, then by what it leaves
-        itself as long as straight lines from there promise more, and by the next where it stays behind a
-        `rival`'s score."""
+    ) -> FittedSet:
+        """Fit a set exactly, and remember it at its best.
+
+        Args:
+            names: The set.
+            begin: Where the fit begins.
+            scales: Whiteners of the first fit. Later fits are whitened by what the set leaves itself, as long
+                as the closed form promises more. A fit that stays behind the rival is begun anew with the
+                next scale.
+            rival: Log evidence [nats] of the set to beat.
+        """
         say(f"fitting {' + '.join(names) or 'nothing'}")
         here, best, key = self.composed.moved(begin), None, frozenset(names)
         for whiten in scales:
-            one = self._judged(here, names, self._moved(here, begin, whiten))
+            one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
                 before = one.score
                 if one.promise < max(before + BETTER, rival - NEAR):
                     break
                 there = self.composed.moved(one.point)
-                again = self._judged(there, names, self._moved(there, one.point, one.whiten))
+                again = self._judge(there, names, self._fit_point(there, one.point, one.whiten))
                 one = max((one, again), key=lambda fitted: fitted.score)
                 if one.score < before + BETTER:
                     break
@@ -232,25 +250,25 @@ class Search:
             if best.score >= rival - NEAR:
                 break
         assert best is not None
-        if key not in self.known or self.known[key].score < best.score:
-            self.known[key] = best
-        return self.known[key]
+        if key not in self.fitted or self.fitted[key].score < best.score:
+            self.fitted[key] = best
+        return self.fitted[key]
 
-    def _moved(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
-        linear = linearise(composed, begin, [], self.starts)
-        return moved_to(composed, linear, whiten, begin)
+    def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
+        linear = linearise(composed, begin, [], self._starts)
+        return fit_effects(composed, linear, whiten, begin)
 
-    def _judged(self, composed: Composed, names: Names, point: Point) -> Settled:
-        linear = linearise(composed, point, [*self.along, *names], self.starts)
+    def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
+        """A set at its fitted point, with its discrepancy and its log evidence (Laplace's)."""
+        linear = linearise(composed, point, [*self.along, *names], self._starts)
         cov = covariances(composed, linear)
         left = np.nan_to_num(linear.residual)
-        off = cov.learned(left)
-        whiten = cov.whitener(off)
-        if wide := cov.off_alone(whiten, left):
-            off = cov.learned(left, wide)
-            whiten = cov.whitener(off, wide)
-        usable = [n for n in names if n in linear.moved]
-        sets = Sets.of(composed.effects, linear, [whiten], usable, self.fold, self.log_odds)
+        discrepancy = cov.estimate(left)
+        whiten = cov.whitener(discrepancy)
+        if wide := cov.outliers(whiten, left):
+            discrepancy = cov.estimate(left, wide)
+            whiten = cov.whitener(discrepancy, wide)
+        sets = self._sets(linear, [whiten], names)
         score = promise = -np.inf
         if not linear.diverged:
             white = whiten(left)
@@ -263,16 +281,28 @@ class Search:
             score += 0.5 * float(np.linalg.slogdet(fit.covariance[np.ix_(inside, inside)])[1])
             score += _prior_constants(sets.size)
             score += len(wide) * ALONE - 1e3 * linear.dropped
-        return Settled(composed, names, point, linear, cov, off, wide, whiten, sets, score, promise)
+        return FittedSet(composed, names, point, linear, cov, discrepancy, wide, whiten, sets, score, promise)
 
-    def place(self, at: Settled, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
-        """All candidates about a point, by the discrepancy there and less of it.
+    def _sets(
+        self,
+        linear: Linear,
+        levels: Sequence[Whitener],
+        names: Sequence[str],
+        joint: Mapping[str, RobotEffect] | None = None,
+    ) -> Sets:
+        """The closed form for those of some candidates (and `joint` ones) that did not diverge."""
+        effects = {**self.composed.effects, **(joint or {})}
+        usable = [n for n in names if n in linear.moved]
+        return Sets.of(effects, linear, levels, usable, self.fold, self.log_odds)
 
-        Those that do not act yet are secants of their usual size: a joint that sticks follows no small
-        change. They stay as they were where the search began; those that lead are rolled out anew.
+    def propose(self, at: FittedSet, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
+        """Candidates about the point of a set, in closed form with its discrepancy and with less of it.
+
+        Candidates that do not act yet are varied by their usual size, for a joint that sticks follows no
+        small change. They stay as they were where the search began; the leading ones are rolled out anew.
         """
         composed, point, held = at.composed, at.point, at.names
-        linear = linearise(composed, point, [*self.along, *held], self.starts)
+        linear = linearise(composed, point, [*self.along, *held], self._starts)
         base, more = base_at(composed, point), {}
         for name in names:
             if name not in held:
@@ -286,24 +316,24 @@ class Search:
         cov = covariances(composed, linear)
         scales = [{n: s * k for n, s in at.discrepancy.items()} for k in LEVELS if at.discrepancy]
         levels = [cov.whitener(d, at.wide) for d in (*scales, NONE)]
-        usable = [n for n in names if n in linear.moved]
-        sets = Sets.of(composed.effects, linear, levels, usable, self.fold, self.log_odds)
+        sets = self._sets(linear, levels, names)
         if not held:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
-        linear = self._where_they_act(composed, base, linear, sets, held)
-        linear, both = self._together(composed, base, linear, sets, held)
-        every = [*usable, *both]
-        return Sets.of({**composed.effects, **both}, linear, levels, every, self.fold, self.log_odds), levels
+        linear = self._roll_out_leaders(composed, base, linear, sets, held)
+        linear, joint = self._joint(composed, base, linear, sets, held)
+        return self._sets(linear, levels, [*names, *joint], joint), levels
 
-    def _together(
+    def _joint(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
     ) -> tuple[Linear, dict[str, RobotEffect]]:
-        """What an encoder misreads and what its servo's command is off by, where they nearly cancel, as one
-        each: the loop closes over the encoder, so that the joint is elsewhere and hardly a number shows it.
-        What counts is how each bends, which no straight line has: they are rolled out along their
-        difference."""
-        more, both = {}, {}
+        """Joint candidates of an encoder's misreading and its servo's command offset that nearly cancel.
+
+        The loop closes over the encoder, so that the joint is elsewhere and hardly a channel shows it. What
+        tells them is how each bends, which no straight line has, so they are rolled out along their
+        difference.
+        """
+        more, joint = {}, {}
         for one, other, against in cancelling(sets, composed.effects):
             name = f"{one}{JOINED}{other}"
             if one in held or other in held or not np.isfinite(against) or abs(against) > FAR:
@@ -314,14 +344,14 @@ class Search:
             moved = self.columns[name]
             if moved is not None:
                 more[name] = moved
-                both[name] = _sized(name)
-        return linear.with_moved(more), both
+                joint[name] = _sized(name)
+        return linear.with_moved(more), joint
 
     def _difference(
         self, composed: Composed, base: Base, one: str, other: str, against: float
     ) -> Moved | None:
-        """How the rows move by a usual size of one and so much `against` it of the other; None where that is
-        not to be had."""
+        """How a usual size of one effect together with `against` usual sizes of the other moves the rows;
+        None where bounds or a rollout forbid it."""
         for sign in (1.0, -1.0):
             point = dict(base.point)
             for name, size in ((one, sign), (other, sign * against)):
@@ -336,27 +366,26 @@ class Search:
                 return Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
         return None
 
-    def _where_they_act(
+    def _roll_out_leaders(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
     ) -> Linear:
-        """The candidates that come near, rolled out where they fit best: what kinks or saturates is a
-        straight line from there only."""
-        first: dict[str, dict[str, float]] = {}
+        """The leading candidates rolled out where they fit best: what kinks or saturates is a straight line
+        from there only."""
+        effects, first = self.composed.effects, dict[str, dict[str, float]]()
         for level in dict.fromkeys((0, sets.gram.shape[0] - 1)):
             others = [n for n in sets.names if n not in held]
             score = sets.scores([(*held, n) for n in others], level)
-            for k in np.argsort(-score)[:LEADERS]:
-                name = others[k]
-                found = point_of(
-                    self.composed.effects, sets.fit((*held, name), level), (*held, name), self.along
-                )
-                first.setdefault(name, dict(found[name]))
+            for name in (others[k] for k in np.argsort(-score)[:LEADERS]):
+                if name not in first:
+                    names = (*held, name)
+                    found = point_of(effects, sets.fit(names, level), names, self.along)
+                    first[name] = dict(found[name])
         more = {}
         for name, at in first.items():
-            known = self.composed.effects[name].parameters
-            far = {n: FAR * p.sd for n, p in known.items()}
-            near = {n: float(np.clip(v, p.nominal - far[n], p.nominal + far[n]))
-                    for (n, p), v in zip(known.items(), at.values(), strict=True)}  # fmt: skip
+            near = {}
+            for (short, p), value in zip(effects[name].parameters.items(), at.values(), strict=True):
+                near[short] = float(np.clip(value, p.nominal - FAR * p.sd, p.nominal + FAR * p.sd))
+            known = effects[name].parameters
             if all(abs(near[n] - p.nominal) < 1e-3 * p.sd for n, p in known.items()):
                 near = {
                     n: p.nominal + (p.sd if p.nominal + p.sd <= p.high else -p.sd) for n, p in known.items()
@@ -366,12 +395,15 @@ class Search:
                 more[name] = one
         return linear.with_moved(more)
 
-    def _better(self, at: Settled, best: Settled) -> Settled | None:
-        """A set that is better than the best where it is fitted, proposed about where another is."""
-        sets, levels = self.place(at, self.wanted)
+    def _find_better(self, at: FittedSet, best: FittedSet) -> FittedSet | None:
+        """A set that beats the best after an exact fit, proposed about the point of `at`.
+
+        `at` is the best itself, or the best less one cause, whose replacements are then sought.
+        """
+        sets, levels = self.propose(at, self.wanted)
         names = [n for n in sets.names if n not in self.against]
         near = neighbours(at.names, sets.names)
-        if at is best and len(names) <= MANY:  # what takes a cause's place is one
+        if at is best and len(names) <= MANY:  # a replacement is a single effect
             near += pairs(at.names, names)
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
@@ -379,55 +411,53 @@ class Search:
         level = [int(k) for k in score.argmax(0)]
         promised = score.max(0) - own + at.score - best.score
         least = BETTER
-        if at is not best:  # what straight lines miss of the best they miss of what takes its place, too
-            known = score.max(0)[[{*names} == {*best.names} for names in near]]
-            least = min(0.0, *(known - own + at.score - best.score)) - NEAR
+        if at is not best:  # straight lines miss as much of a replacement as they miss of the best itself
+            of_best = score.max(0)[[{*names} == {*best.names} for names in near]]
+            least = min(0.0, *(of_best - own + at.score - best.score)) - NEAR
         effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
-        tried, off, found = 0, 0.0, best
+        tried, wrong, found = 0, 0.0, best
         for k in np.argsort(-promised):
-            if tried >= TRIED or promised[k] < least:
+            # Two replacements are fitted whatever straight lines promise: these may miss them by more.
+            if tried >= TRIED or (promised[k] < least and (at is best or tried >= LEARNED)):
                 break
             begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
-            names = self._apart(near[k], begin)
-            if frozenset(names) in self.known or (at is not best and {*best.names} < {*names}):
+            names = self._take_apart(near[k], begin)
+            if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                 continue
             scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
-            one, tried = self.settled(names, begin, scales, best.score), tried + 1
-            off = max(off, one.score - best.score - promised[k])
-            if at is not best and tried == LEARNED:  # what others promise is wrong by as much as of these
-                least = max(least, -NEAR - off)
+            one, tried = self.fit(names, begin, scales, best.score), tried + 1
+            wrong = max(wrong, one.score - best.score - promised[k])
+            if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
+                least = max(least, -NEAR - wrong)
             if one.score > found.score and self._is_better(one, best):
                 found = one
-                if at is best and one.score > best.score + NEAR:  # about it all others are proposed anew
+                if at is best and one.score > best.score + NEAR:  # others are better proposed about it
                     break
         return None if found is best else found
 
-    def gains(self, one: Settled, other: Settled, by: Settled) -> np.ndarray:
-        """Log densities (folds,) of each fold given the others, of one set over those of another, both by the
-        noise and the discrepancy `by` which rows are whitened: how large the discrepancy is differs between
-        motions, so that a set which leaves a smaller one in some of them predicts the others no worse for
-        it."""
+    def gains(self, one: FittedSet, other: FittedSet, by: FittedSet) -> np.ndarray:
+        """Log densities (folds,) of each fold given the others, of one set over another.
+
+        Both are whitened with the discrepancy of `by`: its size differs between motions, so that a set which
+        leaves a smaller one in some of them predicts the others no worse for it.
+        """
         mine, theirs = (self._held_out(s, by.whiten) for s in (one, other))
         return mine - theirs
 
-    def _held_out(self, one: Settled, whiten: Whitener) -> np.ndarray:
-        key = id(one), id(whiten)
-        if key not in self._densities:
-            names = [n for n in one.names if n in one.linear.moved]
-            given = one.composed.effects, one.linear, [whiten], names, self.fold, self.log_odds
-            # Both are kept with it: what is freed may leave its id to another.
-            self._densities[key] = Sets.of(*given).held_out(one.names, 0), one, whiten
-        return self._densities[key][0]
+    def _held_out(self, one: FittedSet, whiten: Whitener) -> np.ndarray:
+        if (one, whiten) not in self._densities:
+            sets = self._sets(one.linear, [whiten], one.names)
+            self._densities[one, whiten] = sets.held_out(one.names, 0)
+        return self._densities[one, whiten]
 
-    def _is_better(self, one: Settled, best: Settled) -> bool:
-        """Whether to go on from a set: likelier, and so by logs that took no part, unless it only does
-        without."""
+    def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
+        """Whether to go on from a set: it is likelier, and drops causes or predicts held-out logs better."""
         if one.score <= best.score + BETTER:
             return False
         return {*one.names} < {*best.names} or predicts_better(self.gains(one, best, best))
 
-    def _apart(self, names: Names, point: dict) -> Names:
-        """The set with pairs taken apart, and its point likewise, in place."""
+    def _take_apart(self, names: Names, point: dict) -> Names:
+        """The set with joint candidates taken apart, and its point likewise, in place."""
         out: list[str] = []
         for name in names:
             if name not in self.against:
@@ -440,44 +470,51 @@ class Search:
                 out.append(one)
         return tuple(dict.fromkeys(out))
 
-    def _exchanged(self, best: Settled) -> Settled | None:
-        """A better set with others in the place of one of the best's."""
+    def _exchange(self, best: FittedSet) -> FittedSet | None:
+        """A better set without one of the best's causes, or with replacements for one."""
         for out in best.names:
             rest = tuple(n for n in best.names if n != out)
-            less = self.known.get(frozenset(rest)) or self.settled(
-                rest, without(best.point, out), [best.whiten]
-            )
-            there = less if self._is_better(less, best) else self._better(less, best)
+            less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), [best.whiten])
+            there = less if self._is_better(less, best) else self._find_better(less, best)
             if there is not None:
                 return there
         return None
 
 
 def _sized(name: str) -> RobotEffect:
-    """Two effects as one, by how much of both acts."""
+    """A joint candidate, whose one parameter is how much of both effects acts."""
     return RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
 
 
 def _prior_constants(sizes: Sequence[int]) -> float:
-    """Constants of the slabs' densities, a multivariate Cauchy's of so many parameters each."""
+    """Log normalising constants of the slabs, one multivariate Cauchy distribution of each size."""
     return float(sum(gammaln((1 + k) / 2) - gammaln(0.5) - 0.5 * k * np.log(np.pi) for k in sizes))
 
 
 def predicts_better(gain: np.ndarray) -> bool:
-    """Whether a set predicts held-out folds better than a rival, by gains (folds,) of log density [nats].
+    """Whether a set predicts held-out folds better than a rival.
 
-    Either by how they scatter between folds (a one-sided t test), or because the folds say so by their odds:
-    if the rival were right, ratios of predictive densities would have a mean of 1, and so exceed 20 in one of
-    20 cases at most (Markov's inequality). As densities are only as good as the discrepancy in them, these
-    odds must hold without the fold that says the most, and no fold may have them against the set. Of two or
-    three logs, in some of which a cause hardly shows, the t test rules out next to nothing.
+    Either the gains are consistent between folds (a one-sided t test), or the folds' odds say so: if the
+    rival were right, ratios of predictive densities would have a mean of 1, and so exceed 20 in at most one
+    of 20 cases (Markov's inequality). As densities are only as good as the discrepancy in them, these odds
+    must hold without the fold that says the most, and no fold may have them against the set. The t test
+    alone rules out next to nothing with two or three logs in some of which a cause hardly shows.
 
-    For the t test gains beyond a nat count by their logarithm: one log in which a cause shows a hundred times
+    In the t test gains beyond a nat count by their logarithm: one log in which a cause shows a hundred times
     as much as in the others must not make the others' agreement look like scatter.
+
+    Args:
+        gain: Gains (folds,) of log density [nats].
     """
     odds = -np.log(BY_CHANCE)
     if gain.size < 2 or (gain.sum() - gain.max() > odds and gain.min() > -odds):
         return True
-    gains = np.arcsinh(gain)
-    sd = max(float(gains.std(ddof=1)), 1e-9) / np.sqrt(gains.size)
-    return bool(student.sf(gains.mean() / sd, gains.size - 1) < BY_CHANCE)
+    return by_chance(np.arcsinh(gain)) < BY_CHANCE
+
+
+def by_chance(gains: np.ndarray) -> float:
+    """The p-value of gains (n,) if their mean is none: one-sided, by Student's t; 0.5 of a single one."""
+    if gains.size < 2:
+        return 0.5
+    sd = max(float(gains.std(ddof=1)), 1e-12)
+    return float(student.sf(gains.mean() / sd * np.sqrt(gains.size), gains.size - 1))

@@ -1,7 +1,7 @@
-"""Windows of a log, each restarted from a state smoothed from the log.
+"""Windows of logs, each simulated from a start that is smoothed from the log.
 
-Rollouts diverge, so a simulator is judged over short windows. A start is read from a polynomial through
-the samples around it; its error is no part of the gap but of the noise (`simgap.robots.whiten`).
+Rollouts drift away from a log, so a simulator is judged over short windows. The error of a start is no part
+of the gap but of the noise (`simgap.robots.whiten`).
 """
 
 from __future__ import annotations
@@ -19,24 +19,28 @@ from simgap.simulators.user import restarts
 
 LENGTH = 0.4  # numerics: s
 FEWEST = 6  # numerics: samples of a window
-# chosen: s of samples on either side that a start is smoothed from, and at least NEIGHBOURS of them
+# chosen: s on either side from which a start is smoothed, over NEIGHBOURS samples or more
 REACH = 0.03
 NEIGHBOURS = 5  # numerics: samples
 DEGREES = (2, 3, 4)  # numerics: of polynomials through them
-# chosen: a start's error over what noise alone makes it: the window's own samples settle the rest
+# chosen: a start's sd over what noise alone gives: the window's own samples settle the rest
 DOUBT = 3.0
-STILL = 0.01  # chosen: share of a channel's range; a stretch in which none goes further is still
-AT_REST, CALM = 0.002, 0.05  # chosen: likewise, and s: what touches and goes no further in this time rests
-JUMPS = "command jumps"  # beside the states of a start: when in its interval a command jumped
-ABRUPT = 4.0  # chosen: times a command's changes before and after, from which it jumps and does not pass
-# A model may lack one thing in flight, another at rest, and a third where bodies strike, slide or roll.
+STILL = 0.01  # chosen: share of a channel's range; a stretch in which no channel travels further is still
+AT_REST, CALM = 0.002, 0.05  # chosen: likewise, and s: what touches and travels no further in this time rests
+JUMPS = "command jumps"  # a further state of a start: when in its interval a command jumped
+ABRUPT = 4.0  # chosen: a change over this many times those before and after is a jump
+# A model may lack different things in flight, at rest, and where bodies strike, slide or roll.
 FLIES, RESTS, STRIKES = REGIMES = ("nothing touches", "bodies rest on each other", "bodies move in contact")
 
 
 @dataclass(frozen=True)
 class Window:
-    """Rows [begin, end) of log number `log`; `start` and its standard deviations by state, or None;
-    `regime`: one of REGIMES, where the simulator tells its contacts."""
+    """Rows [begin, end) of a log.
+
+    `log`, `begin`, `end`: number of the log and its rows; `forward`: whether the start is smoothed from later
+    samples alone; `start`, `doubt`: its states and their standard deviations; None where the simulator does
+    not restart; `regime`: one of REGIMES, where the simulator reports contacts.
+    """
 
     log: int
     begin: int
@@ -50,10 +54,14 @@ class Window:
 def cut(
     simulator: Simulator, recordings: Sequence[Recording], noise: Mapping[str, float], length: float = LENGTH
 ) -> list[Window]:
-    """Windows of about `length` [s] that tile every log, new ones begun at the simulator's `contacts`, and
-    where what touches comes to rest.
+    """Cut every log into windows; new ones begin at changes of contact and where touching bodies come to
+    rest.
 
-    A simulator that cannot be restarted has one window a log. `noise` by channel [its unit].
+    Args:
+        simulator: The robot's model; one that does not restart gets one window a log.
+        recordings: The logs.
+        noise: Standard deviation of one sample by channel [its unit].
+        length: About how long windows are [s].
     """
     out = []
     reach = reaches(simulator, recordings)
@@ -89,9 +97,9 @@ def _begun(
 
 
 def jumps(simulator: Simulator, log: Recording) -> np.ndarray:
-    """The interval [s] (num_timesteps,) in which the commands of each row jumped, 0 where none did.
+    """For each row the interval [s] (num_timesteps,) in which its commands jumped, 0 where they did not.
 
-    A log has commands at samples; a jump between two of them came at some time since the one before.
+    Commands are logged at samples; a jump between two samples happened some time after the earlier one.
     """
     acts = getattr(simulator, "acts", None)
     if acts is None:
@@ -108,7 +116,7 @@ def jumps(simulator: Simulator, log: Recording) -> np.ndarray:
 
 
 def earlier(simulator: Simulator, log: Recording, share: float) -> Recording:
-    """A log whose commands jumped this share of an interval earlier."""
+    """The log with jumping commands carried out this share of their interval earlier."""
     acts = simulator.acts  # type: ignore[attr-defined]
     return log.with_columns({acts: log.columns.get(acts, log.t) - share * jumps(simulator, log)})
 
@@ -120,13 +128,12 @@ def reaches(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, 
 
 
 def moves(log: Recording, begin: int, end: int, reach: Mapping[str, float]) -> bool:
-    """Whether any position goes further than STILL of its `reach` in the rows [begin, end)."""
+    """Whether any position travels over STILL of its `reach` in the rows [begin, end)."""
     return any(travel(log[n][begin:end]) > STILL * most for n, most in reach.items())
 
 
 def resting(log: Recording, reach: Mapping[str, float]) -> np.ndarray:
-    """The samples (num_timesteps,) about which no position goes further than AT_REST of its reach within
-    CALM."""
+    """Samples (num_timesteps,) about which no position travels over AT_REST of its `reach` within CALM."""
     size = max(2, round(CALM / max(float(np.median(np.diff(log.t))), 1e-9))) if len(log) > 1 else 1
     calm = np.full(len(log), bool(reach))
     for name, most in reach.items():
@@ -148,7 +155,7 @@ def _marks(simulator: Simulator, log: Recording) -> list[float]:
 
 
 def _touching(simulator: Simulator, log: Recording) -> np.ndarray:
-    """Whether bodies touch, at every sample of the log."""
+    """Whether bodies touch at each sample (num_timesteps,) of the log."""
     states = getattr(simulator, "contact_states", None)
     if states is None:
         return np.zeros(len(log), bool)
@@ -158,9 +165,10 @@ def _touching(simulator: Simulator, log: Recording) -> np.ndarray:
 
 
 def _readable(simulator: Simulator, log: Recording, end: int) -> int:
-    """The first row with samples on either side to smooth a start from, of a first window up to `end`.
+    """The first row from which a first window up to `end` can begin: with samples on either side.
 
-    A log often begins with a jerk, of which a parabola through later samples alone makes a rate."""
+    A log often begins with a jerk, which a parabola through later samples alone would turn into a wrong rate.
+    """
     if getattr(simulator, "state_at", None) is not None:
         return 0
     row = max(int(np.searchsorted(log.t - log.t[0], REACH - 1e-9)), NEIGHBOURS // 2)
@@ -168,7 +176,7 @@ def _readable(simulator: Simulator, log: Recording, end: int) -> int:
 
 
 def _edges(log: Recording, contacts: Sequence[float], length: float) -> list[int]:
-    """First rows of the windows, and one past the last."""
+    """First rows of the windows, and the end of the last."""
     span = float(log.t[-1] - log.t[0])
     inside = sorted(m - float(log.t[0]) for m in contacts)
     marks = [0.0, *(m for m in inside if 0 <= m < span), span]
@@ -188,8 +196,19 @@ def start_of(
     simulator: Simulator, log: Recording, row: int, noise: Mapping[str, float], forward: bool,
     only: Collection[str] | None = None,
 ) -> dict[str, tuple[float, float]]:  # fmt: skip
-    """State name -> (value, standard deviation) at a row of a log; see `smoothed` for `forward`. `only`: of
-    which columns the states are asked, where each is read from its own."""
+    """The state at a row of a log.
+
+    Args:
+        simulator: The robot's model.
+        log: The log.
+        row: The row.
+        noise: Standard deviation of one sample by channel.
+        forward: Whether later samples alone are used (see `smoothed`).
+        only: Columns whose states are wanted; all by default. Each state is read from its own column.
+
+    Returns:
+        State name -> (value, standard deviation).
+    """
     own = getattr(simulator, "state_at", None)
     if own is not None:
         return {n: (float(v), float(s)) for n, (v, s) in own(log, float(log.t[row])).items()}
@@ -206,13 +225,20 @@ def start_of(
 def smoothed(
     t: np.ndarray, values: np.ndarray, row: int, noise: float, forward: bool = False
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Value and rate at a row, each with its standard deviation, of a polynomial through its neighbours: a
-    parabola, or more where samples show a jerk, of which a parabola would make a rate (AIC: Akaike, IEEE
-    Transactions on Automatic Control 19, 1974).
+    """Value and rate at a row, each with its standard deviation, from a polynomial through its neighbours.
 
-    `forward` takes later samples alone: a contact changes rates. What the polynomial misses counts as noise.
+    A parabola, or a higher degree where samples show a jerk, which a parabola would turn into a wrong rate
+    (AIC: Akaike, IEEE Transactions on Automatic Control 19, 1974). What the polynomial misses counts as
+    noise.
+
+    Args:
+        t: Times (num_timesteps,) [s].
+        values: Samples (num_timesteps,); NaN where missing.
+        row: The row.
+        noise: Standard deviation of one sample.
+        forward: Use later samples alone, as a contact at the row changes rates.
     """
-    first, end = np.searchsorted(t, (t[row] - 2 * REACH, t[row] + 2 * REACH))  # of a long log, a look at few
+    first, end = np.searchsorted(t, (t[row] - 2 * REACH, t[row] + 2 * REACH))  # a slice of a long log
     there = np.isfinite(values[first:end]) & (np.abs(t[first:end] - t[row]) <= REACH)
     near = first + np.flatnonzero(there)
     if near.size < NEIGHBOURS or forward:
@@ -227,7 +253,7 @@ def smoothed(
 
 
 def _fit(x: np.ndarray, y: np.ndarray, degree: int, noise: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Coefficients of a polynomial with their standard deviations, and its AIC at this noise."""
+    """Coefficients of a polynomial, their standard deviations, and its AIC at this noise."""
     design = np.vander(x, degree + 1, increasing=True)
     inverse = np.linalg.inv(design.T @ design)
     found = inverse @ design.T @ y

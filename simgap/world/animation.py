@@ -1,4 +1,4 @@
-"""Animation of fingers and blocks next to their force traces, as a GIF or an MP4."""
+"""Animation of fingers and blocks beside their force traces, as a GIF or an MP4."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from hmmseg.plot.style import BLUE, GREY, INK, OTHER_COLOURS, STYLE
 from simgap.world.dynamics import Record
 from simgap.world.properties import Block
 
-FRAMES = 15.0  # look: a second, in real time
-SIZE, DPI = (9.0, 3.8), 90  # look: in
-PAD = (0.003, 0.008)  # numerics: m, drawn width and height of a fingertip
+FRAMES = 15.0  # look: frames per second, in real time
+SIZE, DPI = (9.0, 3.8), 90  # look: inches, dots per inch
+PAD = (0.003, 0.008)  # numerics: m; drawn width and height of a fingertip
 WRITERS = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
 
@@ -35,7 +35,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Scene:
-    """What moves, at times t (T,) [s]; blocks by name, in the motion's order."""
+    """A motion to draw, at times t (T,) [s]; blocks by name, in the motion's order."""
 
     t: np.ndarray
     motion: Record
@@ -44,7 +44,7 @@ class Scene:
 
 
 def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
-    """Write the animation to `path`, in real time; InputError for another suffix or a lacking ffmpeg."""
+    """Write the animation to `path`, in real time; InputError for another suffix or without ffmpeg."""
     if path.suffix not in WRITERS:
         raise InputError(str(path), f"unknown kind of animation {path.suffix!r}", " or ".join(WRITERS))
     require_encoder(path.suffix)
@@ -58,9 +58,10 @@ def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
         cursors = _draw_traces(panels, scene, traces)
         joints, writer = _joints(scene), WRITERS[path.suffix](fps=FRAMES)
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # laid out once; the rest only moves
+        figure.set_layout_engine("none")  # laid out once; then artists only move
+        rows = np.searchsorted(scene.t, np.arange(scene.t[0], scene.t[-1], 1 / FRAMES))
         with writer.saving(figure, str(path), DPI):
-            for k in _chosen(scene.t):
+            for k in np.minimum(rows, len(scene.t) - 1):
                 for body, (x, y) in zip(bodies, 100 * scene.motion.blocks[k], strict=True):
                     body.set_xy((x - body.get_width() / 2, y - body.get_height() / 2))
                 for finger, pad in enumerate(pads):
@@ -75,21 +76,16 @@ def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
 
 
 def require_encoder(suffix: str) -> None:
-    """InputError where an animation of this suffix cannot be written here."""
+    """InputError if an animation of this suffix cannot be written on this machine."""
     if suffix == ".mp4" and not FFMpegWriter.isAvailable():
         raise InputError("--animation mp4", "the program ffmpeg is not installed", "gif, or ffmpeg")
 
 
-def _chosen(t: np.ndarray) -> np.ndarray:
-    """Rows of `t` nearest to every frame."""
-    return np.clip(np.searchsorted(t, np.arange(t[0], t[-1], 1 / FRAMES)), 0, len(t) - 1)
-
-
 def _draw_scene(stage, scene: Scene):
-    """Ground, blocks, pads and links at their first place; the artists that move."""
+    """Draw ground, blocks, pads and links; the artists that move."""
     seen = np.concatenate([scene.motion.position.reshape(-1, 2), scene.motion.blocks.reshape(-1, 2)])
     left, right = scene.motion.position[..., 0].min(), scene.motion.position[..., 0].max()
-    near = 100 * seen[(seen[:, 0] > left - 0.1) & (seen[:, 0] < right + 0.1)]  # a block never met is far
+    near = 100 * seen[(seen[:, 0] > left - 0.1) & (seen[:, 0] < right + 0.1)]  # without far blocks
     (left, _), (right, top) = near.min(axis=0), near.max(axis=0)
     stage.set(
         xlim=(left - 2, right + 2), ylim=(-0.4, top + 2), aspect="equal", xlabel="x [cm]", ylabel="y [cm]"
@@ -123,6 +119,7 @@ def _joints(scene: Scene) -> list[np.ndarray]:
 
 
 def _draw_traces(panels, scene: Scene, traces: Sequence[Trace]) -> list:
+    """Draw all traces; the lines that mark the current time."""
     cursors = []
     for panel, trace in zip(panels, traces, strict=True):
         for k, (name, t, values) in enumerate(trace.curves):

@@ -18,12 +18,13 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
-# Laws of one contact: a unilateral Kelvin-Voigt spring and Coulomb friction with an anchor.
+# Laws of one contact: a unilateral Kelvin-Voigt spring, and Coulomb friction with an anchor.
 #
-# Both laws are elementwise, continuous in all arguments and differentiable except at the edges of
-# contact and of the friction cone, where the derivative is one-sided and finite.
+# Both are elementwise, continuous in all arguments, and differentiable except at the edges of contact and of
+# the friction cone, where the derivative is one-sided and finite.
 
 FADE = 2e-5  # numerics: m; depth over which damping fades in, so that an impact starts without a jump
 
@@ -31,10 +32,10 @@ FADE = 2e-5  # numerics: m; depth over which damping fades in, so that an impact
 def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) -> Array:
     """Normal force [N] of a spring that only pushes, 0 out of contact.
 
-    `depth` [m] is positive inside, `rate` [m/s] its time derivative. A Kelvin-Voigt element
-    whose damping [N s/m] fades in with depth, as in Hunt & Crossley, "Coefficient of restitution
-    interpreted as damping in vibroimpact", J. Appl. Mech. 42 (1975): a constant damping would
-    make the force jump at touch, and pull at parting.
+    `depth` [m] is positive inside, `rate` [m/s] is its time derivative. A Kelvin-Voigt element whose damping
+    [N s/m] fades in with depth, as in Hunt & Crossley, "Coefficient of restitution interpreted as damping in
+    vibroimpact", J. Appl. Mech. 42 (1975): constant damping would make the force jump at touch and pull at
+    separation.
     """
     depth = jnp.maximum(depth, 0.0)
     faded = damping * jnp.minimum(depth / FADE, 1.0)
@@ -43,13 +44,13 @@ def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) ->
 
 def friction(stiffness: Array, damping: Array, deflection: Array, rate: Array,
              bound: Array) -> tuple[Array, Array]:  # fmt: skip
-    """Tangential force [N] and the elastic deflection [m] that is left, by return mapping.
+    """Tangential force [N] and the remaining elastic deflection [m], by return mapping.
 
-    The contact sticks by a spring from its anchor: a constant load below `bound` (friction
-    coefficient times normal force) holds at a constant deflection for ever. Beyond the bound the
-    anchor is dragged along so that the spring carries the bound exactly (elastic predictor and
-    return mapping: Simo & Hughes, Computational Inelasticity, 1998, chapter 1; the contact model
-    of Cundall & Strack, Géotechnique 29, 1979). Without contact the deflection is 0.
+    The contact sticks through a spring from its anchor: a constant load below `bound` (friction coefficient
+    times normal force) holds at a constant deflection forever. Beyond the bound the anchor is dragged along
+    so that the spring carries exactly the bound (elastic predictor and return mapping: Simo & Hughes,
+    Computational Inelasticity, 1998, chapter 1; the contact model of Cundall & Strack, Géotechnique 29,
+    1979). Without contact the deflection is 0.
     """
     limit = bound / stiffness
     deflection = jnp.clip(deflection, -limit, limit)
@@ -59,7 +60,7 @@ def friction(stiffness: Array, damping: Array, deflection: Array, rate: Array,
 Scalar = Any  # a float or an Array of shape ()
 Scalars = tuple[Scalar, ...]
 
-EDGE = 1e-3  # numerics: m; a contact fades over this length where a face ends
+EDGE = 1e-3  # numerics: m; length over which a contact fades at the end of a face
 
 
 class Physics(NamedTuple):
@@ -86,10 +87,10 @@ class Physics(NamedTuple):
 
 
 class State(NamedTuple):
-    """Blocks' centres and velocities (num_blocks each), and where the contacts' anchors lie.
+    """Centres and velocities of the blocks (num_blocks each), and the anchors of all contacts.
 
-    `pads` (2 x num_blocks), `ground` (num_blocks) and `pairs` (one per pair of blocks) are the
-    relative tangential positions [m] at which a contact carries no shear.
+    Anchors are the relative tangential positions [m] at which a contact carries no shear: `pads` (2 x
+    num_blocks), `ground` (num_blocks) and `pairs` (one per pair of blocks).
     """
 
     x: Scalars
@@ -111,9 +112,8 @@ class Tips(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Forces [N]: `fx`, `fy` that each finger exerts, `block_x`, `block_y` net on each block,
-    `pads` the normal force of each finger on each block, `support` from beneath each block.
-    """
+    """Forces [N]: `fx`, `fy` exerted by each finger, `block_x`, `block_y` net on each block, `pads` the
+    normal force of each finger on each block, `support` the force from beneath each block."""
 
     fx: Scalars
     fy: Scalars
@@ -127,11 +127,11 @@ Values = Any  # a jax Array in compiled code, a NumPy array after it
 
 
 class Record(NamedTuple):
-    """What happened, one row per control period; F fingers (2), B blocks.
+    """A rollout, one row per control period; F fingers (2), B blocks.
 
-    Tips: `position`, `velocity`, `force` (T, F, 2) [m, m/s, N] with x and y last. `blocks` and
-    `block_velocity` (T, B, 2) [m, m/s]. `pads` (T, F, B): normal forces [N]. `support` (T, B):
-    force from beneath [N].
+    Tips: `position`, `velocity`, `force` (T, F, 2) [m, m/s, N], x and y last. Blocks: `blocks` and
+    `block_velocity` (T, B, 2) [m, m/s]. Normal forces `pads` (T, F, B) [N], forces from beneath `support`
+    (T, B) [N].
     """
 
     position: Values
@@ -150,14 +150,14 @@ def tips_of(row: Array) -> Tips:
 
 
 def row_of(state: State, tips: Tips, loads: Loads) -> Array:
-    """Everything recorded, in the order in which `record_of` takes it apart."""
+    """Everything recorded as one row; `record_of` is the inverse."""
     parts = [tips.x, tips.y, tips.vx, tips.vy, loads.fx, loads.fy, state.x, state.y, state.vx, state.vy,
              *loads.pads, loads.support]  # fmt: skip
     return jnp.stack([value for part in parts for value in part])
 
 
 def record_of(rows: Array, num_blocks: int) -> Record:
-    """Rows of `row_of` taken apart."""
+    """The record in rows (T, n) of `row_of`."""
 
     def pair(start: int, width: int) -> Array:
         return jnp.stack([rows[:, start : start + width], rows[:, start + width : start + 2 * width]], -1)
@@ -167,13 +167,19 @@ def record_of(rows: Array, num_blocks: int) -> Record:
                   rows[:, b + 4 * n : b + 6 * n].reshape(-1, 2, n), rows[:, b + 6 * n :])  # fmt: skip
 
 
+def interpolated(t: np.ndarray, fine: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (T, ...) at times `fine` (T,), interpolated linearly at times t (n,): (n, ...)."""
+    columns = values.reshape(len(fine), -1).T
+    return np.stack([np.interp(t, fine, column) for column in columns], 1).reshape(t.size, *values.shape[1:])
+
+
 def pairs(num_blocks: int) -> tuple[tuple[int, int], ...]:
     """All pairs of blocks, in the order of `State.pairs`."""
     return tuple(itertools.combinations(range(num_blocks), 2))
 
 
 def resting_state(physics: Physics, x: Sequence[Scalar], y: Sequence[Scalar]) -> State:
-    """Blocks at rest with their centres at x, y [m]; no contact carries shear."""
+    """Blocks at rest, centred at x, y [m]; no contact carries shear."""
     zeros = tuple(0.0 * value for value in x)
     ground = tuple(_along(physics, a, b) for a, b in zip(x, y, strict=True))
     offsets = tuple(x[i] - x[j] for i, j in pairs(len(x)))
@@ -181,7 +187,8 @@ def resting_state(physics: Physics, x: Sequence[Scalar], y: Sequence[Scalar]) ->
 
 
 def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
-    """Contact forces in a configuration, and the state with slipping anchors dragged along."""
+    """Contact forces in a configuration, and the state with the anchors of slipping contacts dragged
+    along."""
     n = len(state.x)
     force_x: list[Scalar] = [0.0] * n
     force_y: list[Scalar] = [-w for w in physics.weight]
@@ -225,7 +232,7 @@ Moving = TypeVar("Moving", State, Tips)
 
 
 def drift(moving: Moving, h: Scalar) -> Moving:
-    """Positions moved on by h [s] at constant velocity."""
+    """Positions advanced by h [s] at constant velocity."""
     x, y = (
         tuple(a + h * v for a, v in zip(at, speed, strict=True))
         for at, speed in ((moving.x, moving.vx), (moving.y, moving.vy))
@@ -234,7 +241,7 @@ def drift(moving: Moving, h: Scalar) -> Moving:
 
 
 def kick(physics: Physics, state: State, loads: Loads, h: Scalar) -> State:
-    """Velocities changed by the loads acting for h [s]."""
+    """Velocities advanced by h [s] under constant loads."""
     rate = tuple(h * physics.gravity / w for w in physics.weight)
     return state._replace(
         vx=tuple(v + r * f for v, r, f in zip(state.vx, rate, loads.block_x, strict=True)),
@@ -243,11 +250,11 @@ def kick(physics: Physics, state: State, loads: Loads, h: Scalar) -> State:
 
 
 def substep(physics: Physics, state: State, tips: Tips, h: Scalar) -> State:
-    """One step of h [s] under tips given at its middle: half drift, kick, half drift.
+    """One step of h [s], with the tips given at its middle: half drift, kick, half drift.
 
-    The position form of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical
-    Integration, 2006, section I.1): second order and symplectic where nothing dissipates, one
-    evaluation of the forces a step. Stable for h times the fastest frequency below 2.
+    The position form of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical Integration,
+    2006, section I.1): second order, symplectic without dissipation, one force evaluation per step. Stable
+    for h times the fastest frequency below 2.
     """
     state, loads = interact(physics, drift(state, h / 2), tips)
     return drift(kick(physics, state, loads, h), h / 2)
@@ -278,7 +285,7 @@ def energy(physics: Physics, state: State, tips: Tips) -> Scalar:
 
 def _pad_depth(physics: Physics, state: State, tips: Tips, finger: int, sign: float,
                i: int) -> tuple[Scalar, Scalar]:  # fmt: skip
-    """Compression of a pad by a block, and the share of the pad that meets the block's side."""
+    """Compression [m] of a pad by a block, and the share of the pad that faces the block's side."""
     depth = physics.width[i] / 2 - sign * (state.x[i] - tips.x[finger])
     reach = physics.height[i] / 2 - jnp.abs(tips.y[finger] - state.y[i])
     # A finger past the block's middle is behind another block, not inside this one.
@@ -288,6 +295,7 @@ def _pad_depth(physics: Physics, state: State, tips: Tips, finger: int, sign: fl
 
 def _pad(physics: Physics, state: State, tips: Tips, finger: int, sign: float,
          i: int) -> tuple[Scalar, Scalar, Scalar]:  # fmt: skip
+    """Normal force [N], shear [N] and new anchor [m] of a finger's contact with a block."""
     depth, share = _pad_depth(physics, state, tips, finger, sign, i)
     stiffness = physics.pad_normal[finger] * share
     push = normal_force(stiffness, stiffness * physics.pad_time, depth,
@@ -305,13 +313,15 @@ def _along(physics: Physics, x: Scalar, y: Scalar) -> Scalar:
 
 
 def _ground_depth(physics: Physics, state: State, i: int) -> tuple[Scalar, Scalar]:
-    """Depth of a block's bottom in the ground, and its rate."""
+    """Depth [m] of a block's bottom in the ground, and its rate [m/s]."""
     sine, cosine = jnp.sin(physics.tilt), jnp.cos(physics.tilt)
     depth = sine * state.x[i] - cosine * (state.y[i] - physics.height[i] / 2)
     return depth, sine * state.vx[i] - cosine * state.vy[i]
 
 
 def _ground(physics: Physics, state: State, i: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Forces fx, fy on a block [N], their normal part, and the new anchor [m] of its contact with the
+    ground."""
     depth, rate = _ground_depth(physics, state, i)
     damping = _damping(physics, physics.weight[i])
     push = normal_force(physics.support_stiffness, damping, depth, rate)
@@ -325,10 +335,10 @@ def _ground(physics: Physics, state: State, i: int) -> tuple[Scalar, Scalar, Sca
 
 def _pair_depths(physics: Physics, state: State, i: int,
                  j: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:  # fmt: skip
-    """Vertical depth with its share of contact, then the share of side contact and its depth."""
+    """Depth of a vertical contact and its share of the face, then the share and depth of a side contact."""
     depth = (physics.height[i] + physics.height[j]) / 2 - jnp.abs(state.y[i] - state.y[j])
     overlap = (physics.width[i] + physics.width[j]) / 2 - jnp.abs(state.x[i] - state.x[j])
-    # Of the two ways out the shorter one is the contact.
+    # The shorter of the two ways out is the contact.
     share = jnp.clip((overlap - jnp.maximum(depth, 0.0)) / EDGE, 0.0, 1.0)
     beside = jnp.clip((depth - jnp.maximum(overlap, 0.0)) / EDGE, 0.0, 1.0)
     return depth, share, beside, overlap
@@ -336,7 +346,7 @@ def _pair_depths(physics: Physics, state: State, i: int,
 
 def _pair(physics: Physics, state: State, i: int, j: int,
           anchor: Scalar) -> tuple[Scalar, Scalar, Scalar]:  # fmt: skip
-    """Force of block j on block i, and the anchor of their friction (side contact has none)."""
+    """Force of block j on block i, and the new anchor of their friction (a side contact has none)."""
     depth, share, beside, overlap = _pair_depths(physics, state, i, j)
     up = jnp.where(state.y[i] > state.y[j], 1.0, -1.0)
     right = jnp.where(state.x[i] > state.x[j], 1.0, -1.0)
@@ -351,18 +361,20 @@ def _pair(physics: Physics, state: State, i: int, j: int,
 
 
 def _damping(physics: Physics, weight: Scalar) -> Scalar:
-    """Damping [N s/m] of a support under a body of this weight."""
+    """Damping [N s/m] of a support beneath a body of this weight [N]."""
     return 2 * physics.support_damping * jnp.sqrt(physics.support_stiffness * weight / physics.gravity)
 
 
-# The position-controlled hand performing a command: fingertips that feel what they touch.
+# The position-controlled hand that performs a command.
 #
-# Each fingertip is a mass drawn to the commanded motion by a spring and a damper (impedance
-# control: Hogan, J. Dyn. Sys. Meas. Control 107, 1985) and held back by the contact forces, so
-# that grip and pressing come from commanding positions beyond the contact.
+# Each fingertip is a mass drawn to the commanded motion by a spring and a damper (impedance control: Hogan,
+# J. Dyn. Sys. Meas. Control 107, 1985) and held back by the contact forces, so that grip and pressing result
+# from commanding positions beyond the contact.
 
-CONTROL_PERIOD = 1e-3  # numerics: s; commands and records are this far apart
-BUCKET = 4000  # numerics: control periods; commands are padded to multiples, so that few programs are made
+CONTROL_PERIOD = 1e-3  # numerics: s; between commands, and between records
+BUCKET = (
+    4000  # numerics: control periods; commands are padded to multiples of it, so few programs are compiled
+)
 
 
 class Impedance(NamedTuple):
@@ -375,9 +387,9 @@ class Impedance(NamedTuple):
 
 @partial(jax.jit, static_argnames=("substeps",))
 def perform(physics: Physics, hand: Impedance, command: Array, state: State, substeps: int) -> Record:
-    """Record of a commanded motion: `command` (T, 4) is x1, y1, x2, y2 [m] per control period.
+    """Perform a commanded motion: `command` (T, 4) is x1, y1, x2, y2 [m] per control period.
 
-    Tips start at rest at the first command. Between commands the motion is linear.
+    Tips start at rest at the first command. Commands are interpolated linearly.
     """
     h = CONTROL_PERIOD / substeps
     slope = jnp.diff(command, axis=0, append=command[-1:]) / CONTROL_PERIOD
@@ -403,7 +415,7 @@ def perform(physics: Physics, hand: Impedance, command: Array, state: State, sub
 
 
 def _pull(hand: Impedance, tips: Tips, target: Tips, loads: Loads, h: Scalar) -> Tips:
-    """Tip velocities after h [s] of the controller's pull and the reaction of what is touched."""
+    """Tips with velocities advanced by h [s] under the controller's pull and the contact forces."""
 
     def speed(position: Scalar, velocity: Scalar, aim: Scalar, rate: Scalar, load: Scalar) -> Scalar:
         pull = hand.stiffness * (aim - position) + hand.damping * (rate - velocity)

@@ -1,9 +1,9 @@
-"""An operator who performs any block task: motions, grip, dwell, wander and tremor of a person.
+"""A simulated operator who performs any block task, with the motions, grip, dwell and tremor of a person.
 
-Plans in commanded fingertip positions; the compliant hand (`simgap.world.dynamics`) turns what is
-commanded beyond a contact into grip and pressing. Motions are minimum-jerk (Flash & Hogan,
-J. Neurosci. 5, 1985), superposed where one begins before another ends (Flash & Henis, J. Cogn.
-Neurosci. 3, 1991); physiological tremor lies at 6-12 Hz.
+A plan is a sequence of commanded fingertip positions; the compliant hand (`simgap.world.dynamics`) turns
+commands beyond a contact into grip and pressing. Motions are minimum-jerk (Flash & Hogan, J. Neurosci. 5,
+1985) and are superposed where one begins before another ends (Flash & Henis, J. Cogn. Neurosci. 3, 1991);
+physiological tremor lies at 6-12 Hz.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from simgap.world.virtual_model import finite_stiffness
 
 TREMOR_BAND = (6.0, 12.0)  # cited: Hz
 WANDER_BAND = (0.1, 0.6)  # prior: Hz
-HOVER = 0.008  # look: m; open fingers pass this far above the highest block
+HOVER = 0.008  # look: m; clearance of the open fingers above the highest block
 NEAR = 0.0025  # look: m above touchdown, where a quick descent becomes a slow approach
-PACE = 5.0  # cited: s a move at least, the paper's (two moves in 10 s)
+PACE = 5.0  # cited: s; shortest time per move, the paper's (two moves in 10 s)
 
 
 def _pair(given: Any) -> Any:
@@ -44,11 +44,11 @@ Above = Annotated[tuple[FinitePositive, Finite], BeforeValidator(_pair), AfterVa
 
 
 class OperatorSettings(StrictTable):
-    """How the operator works: every quantity is drawn uniformly from its range for each motion.
+    """Ranges from which the operator's quantities are drawn uniformly, once per motion.
 
-    Times [s], lengths [m], forces [N]; `pace` divides all durations of motion and dwell. The
-    hand's `hand_stiffness` [N/m], `hand_mass` [kg] and `hand_damping` (ratio) are drawn once a
-    trial, as are `offset` (of the fingers' heights) and rms `tremor` and `wander` of each tip.
+    Times [s], lengths [m], forces [N]; `pace` divides all durations. Drawn once per trial: the hand's
+    `hand_stiffness` [N/m], `hand_mass` [kg] and `hand_damping` (ratio), the `offset` between the fingers'
+    heights, and the rms `tremor` and `wander` of each tip.
     """
 
     grip: Above = (2.0, 3.2)
@@ -61,15 +61,15 @@ class OperatorSettings(StrictTable):
     close: Range = (0.18, 0.26)
     hold: Range = (0.3, 0.5)
     lift: Range = (0.36, 0.48)
-    air: Range = (0.05, 0.25)  # between the parts of a carry; negative: they overlap
+    air: Range = (0.05, 0.25)  # pause between the parts of a carry; if negative, they overlap
     approach: Range = (0.14, 0.2)
     place: Range = (0.3, 0.5)
     slide: Range = (0.6, 0.9)
     open: Range = (0.14, 0.2)
     finish: Range = (0.3, 0.4)
-    clearance: Range = (0.010, 0.013)  # opening beyond a block's width
+    clearance: Range = (0.010, 0.013)  # opening in excess of a block's width
     rise: Range = (0.012, 0.018)
-    grasp: Range = (-0.001, 0.001)  # height of the grasp over the block's centre
+    grasp: Range = (-0.001, 0.001)  # height of the grasp above the block's centre
     misplacement: Range = (-0.0008, 0.0008)
     offset: Range = (-0.0005, 0.0005)
     tremor: Range = (2.5e-5, 5.5e-5)
@@ -81,7 +81,7 @@ class OperatorSettings(StrictTable):
 
 
 def read_operator(path: str | Path) -> OperatorSettings:
-    """Settings from a TOML or JSON file: [low, high] or one number by name; InputError for others."""
+    """Settings from a TOML or JSON file: [low, high] or one number per name; InputError if invalid."""
     json = Path(path).suffix.lower() == ".json"
     table = read_json(path, "operator settings") if json else read_toml(path)
     return validated(OperatorSettings, table, str(path))
@@ -89,7 +89,7 @@ def read_operator(path: str | Path) -> OperatorSettings:
 
 @dataclass(frozen=True)
 class Window:
-    """When a move was commanded [s]: closing, lifting (or pushing), midway, opening, let go."""
+    """Command times of a move [s]: closing, lifting (or pushing), midway, opening, let go."""
 
     object: str
     slide: bool
@@ -102,9 +102,10 @@ class Window:
 
 @dataclass(frozen=True)
 class Plan:
-    """Commanded tips (num_periods, 4): x1, y1, x2, y2 [m]; the hand and the start of every block.
+    """Commanded tips (num_periods, 4): x1, y1, x2, y2 [m], one row per control period.
 
-    `impedance` is (mass [kg], stiffness [N/m], damping [N s/m]); `start` gives block centres [m].
+    `impedance` of the hand is (mass [kg], stiffness [N/m], damping [N s/m]), `start` the initial centre of
+    every block [m], `duration` [s] of the trial.
     """
 
     command: np.ndarray
@@ -115,7 +116,7 @@ class Plan:
 
 
 def minimum_jerk(phase: np.ndarray) -> np.ndarray:
-    """Share of a minimum-jerk motion done at a phase of 0 to 1 (Flash & Hogan 1985)."""
+    """Completed share of a minimum-jerk motion at a phase of 0 to 1 (Flash & Hogan 1985)."""
     s = np.clip(phase, 0.0, 1.0)
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
 
@@ -139,7 +140,7 @@ class _Coordinate:
 
 
 class _Performer:
-    """One performance being planned: the commanded coordinates, the table and the clock [s]."""
+    """State of a performance while it is planned: commanded coordinates, tabletop and clock [s]."""
 
     def __init__(self, rig: Rig, blocks: Blocks, table: Tabletop, settings: OperatorSettings,
                  rng: np.random.Generator) -> None:  # fmt: skip
@@ -151,21 +152,21 @@ class _Performer:
         self.clock = self.time("rest")
 
     def draw(self, name: str) -> float:
-        """A value of a setting."""
+        """Draw a value of a setting."""
         return float(self.rng.uniform(*getattr(self.settings, name)))
 
     def time(self, name: str, way: float = 0.0, usual: float = 1.0) -> float:
-        """A duration [s] at the operator's pace, longer where the way [m] is longer than usual."""
+        """Draw a duration [s] at the operator's pace, longer if the way [m] exceeds the usual one."""
         return self.draw(name) / self.pace * max(1.0, way / usual)
 
     def begin(self, name: str) -> None:
-        """Wait open, above and next to the first block."""
+        """Wait with open fingers above and next to the first block."""
         self.x = _Coordinate(self.table.x[name] + self.rng.uniform(-0.02, 0.02))
         self.y = _Coordinate(self.table.top() + self.rng.uniform(0.012, 0.022))
         self.gap = _Coordinate(self.blocks[name].width + self.draw("clearance"))
 
     def perform(self, move: Move) -> Window:
-        """Pregrasp, pickup, carry or slide, place and release of one move."""
+        """Plan pregrasp, pickup, carry or slide, place and release of a move."""
         block, centre = self.blocks[move.object], self.table.centre(move.object)
         grasp = centre + self.draw("grasp")
         self._reach(self.table.x[move.object], grasp, block.width + self.draw("clearance"))
@@ -184,7 +185,7 @@ class _Performer:
         return Window(move.object, move.slide, close, lift, middle, release, end)
 
     def _reach(self, x: float, y: float, opening: float) -> None:
-        """Go over a block and come down around it."""
+        """Move over a block and descend around it."""
         travel = self.time("travel", abs(x - self.x.target), 0.05)
         self.x.go(x + self.draw("misplacement"), self.clock, travel)
         self.gap.go(max(opening, self.gap.target), self.clock, travel)
@@ -194,7 +195,7 @@ class _Performer:
         self.clock = down + descend + self.time("dwell")
 
     def _slide(self, move: Move, start: float) -> tuple[float, float]:
-        """Push a block along its support; times [s] midway and at the end."""
+        """Push a block along its support; the times [s] midway and at the end."""
         target = self.table.slide(move, self.draw("misplacement"))
         way = abs(target - self.x.target)
         duration = self.time("slide", way, 0.05) * min(1.0, max(0.4, way / 0.03))
@@ -203,7 +204,8 @@ class _Performer:
         return start + duration / 2, start + duration
 
     def _carry(self, move: Move, start: float, grasp: float) -> tuple[float, float]:
-        """Lift a block, bring it over its destination and press it on; times [s] midway and at the end."""
+        """Lift a block, carry it over its destination and press it down; the times [s] midway and at the
+        end."""
         block, before = self.blocks[move.object], self.table.centre(move.object)
         target = self.table.carry(move, self.draw("misplacement"))
         rest, rise = self.table.centre(move.object), self.draw("rise")
@@ -227,7 +229,7 @@ class _Performer:
 
 def plan(task: BlockTask, rig: Rig, blocks: Blocks, settings: OperatorSettings,
          rng: np.random.Generator) -> Plan:  # fmt: skip
-    """Commands for one performance of a task, all that varies drawn from `rng`."""
+    """Plan one performance of a task, with all variation drawn from `rng`."""
     table = lay_out(task, blocks, settings.clearance[1], settings.misplacement, rng)
     start = {name: (table.x[name], table.centre(name)) for name in task.objects}
     performer = _Performer(rig, blocks, table, settings, rng)
@@ -247,7 +249,7 @@ def plan(task: BlockTask, rig: Rig, blocks: Blocks, settings: OperatorSettings,
 def _oscillation(
     t: np.ndarray, band: tuple[float, float], rms: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Narrow-band motion [m] of a given rms: sinusoids with random frequencies and phases."""
+    """Narrow-band motion [m] (T,) of a given rms: sinusoids of random frequency and phase."""
     count = 6
     frequency, phase = rng.uniform(*band, (count, 1)), rng.uniform(0, 2 * np.pi, (count, 1))
     return rms * np.sqrt(2 / count) * np.sin(2 * np.pi * frequency * t + phase).sum(axis=0)

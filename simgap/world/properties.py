@@ -1,4 +1,4 @@
-"""Blocks of a virtual scene: given, read from a file, or drawn at random."""
+"""Blocks of a virtual scene (given, read from a file or drawn at random) and the tabletop they stand on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hmmseg.io.schema import read_json
 from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.tables import listed
 
-DEFAULT_FRICTION = 1.2  # prior: of foam on a block, where nothing says otherwise
+DEFAULT_FRICTION = 1.2  # prior: of foam on a block, unless stated
 
 
 @dataclass(frozen=True)
@@ -45,13 +45,13 @@ PAPER_BLOCKS: Blocks = {"block1": Block(0.343, 0.0159, 0.0160), "block2": Block(
 
 
 def paper_blocks(task: BlockTask) -> dict[str, Block]:
-    """The paper's blocks for the objects of a task: by their names, in turn where names differ."""
+    """The paper's blocks for the objects of a task, by name; in turn if names differ."""
     known = list(PAPER_BLOCKS.values())
     return {name: PAPER_BLOCKS.get(name, known[k % len(known)]) for k, name in enumerate(task.objects)}
 
 
 def blocks_table(blocks: Blocks) -> Table:
-    """Blocks for people to read, lengths in cm as the paper has them."""
+    """A table of blocks for people, lengths in cm as in the paper."""
     rows = []
     for name, b in blocks.items():
         lengths = (f"{100 * length:.4g} cm" for length in (b.width, b.height))
@@ -59,21 +59,11 @@ def blocks_table(blocks: Blocks) -> Table:
     return listed("blocks", ("block", "weight", "width", "height", "friction"), rows)
 
 
-def random_properties(task: BlockTask, seed: int) -> dict[str, Block]:
-    """Blocks for every object of a task, drawn over what two fingers can handle.
-
-    Uniform: weights 0.25-0.65 N, widths 14-29 mm, heights 12-19 mm, friction 1.0-1.4.
-    """
-    rng = np.random.default_rng([seed, 1])
-    return {name: Block(rng.uniform(0.25, 0.65), rng.uniform(0.014, 0.029), rng.uniform(0.012, 0.019),
-                        rng.uniform(1.0, 1.4)) for name in task.objects}  # fmt: skip
-
-
 def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
-    """Blocks from an `actual.toml` or from the JSON of `identify`; InputError for anything at fault.
+    """Read blocks from an `actual.toml` or from the JSON of `identify`; InputError if invalid.
 
-    Values are `value` or `mean`. Friction is taken where its mean is known; a lower bound alone
-    leaves the default, raised to the bound. A property that could not be identified is refused.
+    Values are `value` or `mean`. Friction is used if its mean is known; a lower bound alone raises the
+    default to at least the bound. A property that could not be identified is refused.
     """
     path = Path(path)
     if path.suffix.lower() == ".json":
@@ -112,15 +102,15 @@ def _friction(entry: Any, where: str) -> float:
     return _value(entry, where, entry.get("unit", "1") if isinstance(entry, dict) else "1")
 
 
-# The table as the operator knows it: piles of blocks at spots along the ground.
+# The tabletop as the operator knows it: piles of blocks at spots along the ground.
 
-MIDDLE = 0.13  # look: m; the middle of the hand's workspace
-NUDGE = 0.005  # look: m; a slide where there is no room for more
-ORDERS = 12  # numerics: of the piles, tried to leave room for slides
+MIDDLE = 0.13  # look: m; middle of the hand's workspace
+NUDGE = 0.005  # look: m; length of a slide where there is no room for more
+ORDERS = 12  # numerics: orders of the piles tried in search of room for slides
 
 
 def standing_heights(on: Mapping[str, str], heights: Mapping[str, float]) -> dict[str, float]:
-    """Height of every block's centre above the ground [m] from what each stands on."""
+    """Height of every block's centre above the ground [m], given what each stands on."""
 
     def top(name: str) -> float:
         return 0.0 if name == GROUND else heights[name] + top(on[name])
@@ -129,10 +119,10 @@ def standing_heights(on: Mapping[str, str], heights: Mapping[str, float]) -> dic
 
 
 class Tabletop:
-    """Where every block stands; changed by the moves as they are planned.
+    """Where every block stands; updated by each planned move.
 
-    `x` [m] is every block's centre, `on` what it stands on, `spot` the place (index into `spots`)
-    of a pile's lowest block.
+    `x` [m] are the blocks' centres, `on` what each stands on, `spot` the place (index into `spots`) of the
+    lowest block of each pile.
     """
 
     def __init__(self, task: BlockTask, blocks: Blocks, spots: np.ndarray, piles: Mapping[str, int]) -> None:
@@ -141,7 +131,7 @@ class Tabletop:
         self.x = {name: float(spots[self.place(name)]) for name in task.objects}
 
     def place(self, name: str) -> int:
-        """Spot of the pile that a block is in."""
+        """Spot of the pile that contains a block."""
         while self.on[name] != GROUND:
             name = self.on[name]
         return self.spot[name]
@@ -151,11 +141,11 @@ class Tabletop:
         return standing_heights(self.on, {n: block.height for n, block in self.blocks.items()})[name]
 
     def top(self, without: str | None = None) -> float:
-        """Height of the highest block's top [m], one block left out."""
+        """Height of the highest block's top [m], leaving one block out."""
         return max((self.centre(n) + self.blocks[n].height / 2 for n in self.on if n != without), default=0.0)
 
     def carry(self, move: Move, misplacement: float) -> float:
-        """Perform a lifted move; where the block's centre comes to stand [m]."""
+        """Perform a lifted move; the new centre of the block [m]."""
         if move.to == GROUND:
             here = self.place(move.object)
             spot = min(self._free(), key=lambda k: abs(k - here))
@@ -168,7 +158,7 @@ class Tabletop:
         return float(target)
 
     def slide(self, move: Move, misplacement: float) -> float:
-        """Perform a slide to a free spot beside, or by a little; where the centre comes to stand [m]."""
+        """Slide a block to a free neighbouring spot, or a little way; its new centre [m]."""
         here, x = self.place(move.object), self.x[move.object]
         beside = [k for k in self._free() if abs(k - here) == 1]
         if move.to == GROUND and beside:
@@ -203,7 +193,7 @@ def lay_out(task: BlockTask, blocks: Blocks, clearance: float, misplacement: tup
 
 
 def _nudges(task: BlockTask, table: Tabletop) -> int:
-    """How many slides along the ground find no free spot beside them."""
+    """Number of slides along the ground that find no free neighbouring spot."""
     table, count = deepcopy(table), 0
     for move in task.performed:
         if move.slide:
@@ -216,7 +206,8 @@ def _nudges(task: BlockTask, table: Tabletop) -> int:
 
 
 def _spots_needed(task: BlockTask) -> int:
-    """Most piles at any time, counting the spot that a block leaves for another on the ground."""
+    """Largest number of piles at any time, counting the spot that a block vacates for another one."""
+
     on = dict(task.initial)
     most = sum(place == GROUND for place in on.values())
     for move in task.performed:

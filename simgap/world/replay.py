@@ -1,4 +1,4 @@
-"""Replay: a recording's finger motions drive the virtual model, which predicts forces and blocks."""
+"""Replay: the finger motions of a recording drive the virtual model, which predicts forces and blocks."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import segment
-from simgap.world.dynamics import BUCKET, CONTROL_PERIOD, Record
+from simgap.world.dynamics import BUCKET, CONTROL_PERIOD, Record, interpolated
 from simgap.world.operator import Plan, Window
 from simgap.world.properties import Blocks, standing_heights
 from simgap.world.virtual_model import Surroundings, physics, rollout, standing, substeps_for
 
 # Smooth finger motions from noisy samples of position and velocity.
 #
-# Position noise of 0.02 mm is 0.1 N through a foam pad, several times the force sensor's noise, so
-# a replay is driven by the smoothed motion. Fingers rest for seconds and stop within milliseconds
-# where they touch: every sample takes a local parabola, fitted to positions and velocities, over
-# the widest window (before, after or around it) that the data do not refute. This is Lepski's
-# choice of bandwidth by tests (Goldenshluger & Nemirovski, Math. Meth. Statist. 6, 1997).
+# Through a foam pad, position noise of 0.02 mm makes 0.1 N, several times the force sensor's noise, so a
+# replay is driven by smoothed motion. Fingers rest for seconds and stop within milliseconds at contact: each
+# sample gets a local parabola, fitted to positions and velocities over the widest window (before, after or
+# around it) that the data do not reject. This is Lepski's choice of bandwidth by tests (Goldenshluger &
+# Nemirovski, Math. Meth. Statist. 6, 1997).
 
-REACHES = (1, 2, 3, 4, 6, 8, 12, 16, 24)  # numerics: samples on a side
-TOLERANCE = 1.2  # prior: standard deviation allowed over the sensors': a held finger still trembles
-LEVEL = 0.1  # chosen: of the test that refutes a window
+REACHES = (1, 2, 3, 4, 6, 8, 12, 16, 24)  # numerics: samples on either side
+TOLERANCE = 1.2  # prior: standard deviation over the sensors', as a held finger still trembles
+LEVEL = 0.1  # chosen: level of the test that rejects a window
 AGREEMENT = 1.5  # chosen: standard deviations within which a wider window must agree with the narrower ones
 
 
@@ -41,8 +41,8 @@ AGREEMENT = 1.5  # chosen: standard deviations within which a wider window must 
 class Motion:
     """Smoothed motion of several axes at times `t` (T,) [s].
 
-    `position`, `velocity` (T, axes) [m, m/s]; `sd` (T, axes) [m] of the position, inf where a hole in
-    the samples was only bridged.
+    `position`, `velocity` (T, axes) [m, m/s], and the position's `sd` (T, axes) [m], inf where a gap in the
+    samples was only interpolated.
     """
 
     t: np.ndarray
@@ -59,9 +59,9 @@ class Motion:
 
 def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_position: np.ndarray,
            sd_velocity: np.ndarray) -> Motion:  # fmt: skip
-    """Motion from samples (T, axes) of position [m] and velocity [m/s], NaN where missing.
+    """Smooth samples (T, axes) of position [m] and velocity [m/s], NaN where missing.
 
-    `sd_*` (T, axes) are one sample's noise.
+    `sd_*` (T, axes) is the noise of one sample.
     """
     weights = [np.where(np.isfinite(z), 1.0 / (TOLERANCE * sd), 0.0)
                for z, sd in ((position, sd_position), (velocity, sd_velocity))]  # fmt: skip
@@ -80,7 +80,7 @@ def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_positio
             high = np.where(growing[k], np.minimum(high, found[..., 0] + width), high)
             better = growing[k] & (found[..., 2] < best[..., 2])
             best[better] = found[better]
-    for axis in range(best.shape[1]):  # holes wider than any window
+    for axis in range(best.shape[1]):  # gaps wider than any window
         there = np.isfinite(best[:, axis, 2])
         for part in (0, 1):
             best[:, axis, part] = np.interp(t, t[there], best[there, axis, part])
@@ -89,10 +89,10 @@ def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_positio
 
 def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray], before: int,
              after: int) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Parabolas about every sample over so many samples before and after it.
+    """Fit a parabola about every sample, over the given numbers of samples before and after it.
 
-    Position, velocity and variance (T, axes, 3) of each, and (T, axes) whether the data allow it.
-    A window of one neighbour is always allowed: there is nothing to fall back on.
+    Returns position, velocity and variance (T, axes, 3) at the sample, and whether the data accept the window
+    (T, axes). A window with one neighbour is always accepted: there is no narrower one.
     """
     n = t.size
     rows = np.arange(n)[:, None] + np.arange(-before, after + 1)
@@ -126,7 +126,7 @@ def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray]
     return np.stack([solution[..., 0] + samples[0], solution[..., 1] / unit, variance], -1), fits
 
 
-APART = 0.1  # look: m; where a block stands that the recording never locates
+APART = 0.1  # look: m; distance between blocks that the recording never locates
 
 # physics: mean and difference coordinates (x, y, distance, offset) from tips (x1, y1, x2, y2), and back.
 TO_MEAN = np.array([[0.5, 0, 0.5, 0], [0, 0.5, 0, 0.5], [-1, 0, 1, 0], [0, -1, 0, 1]])
@@ -137,8 +137,8 @@ TO_TIPS = np.linalg.inv(TO_MEAN)
 class Replay:
     """Predictions for one recording; T samples, 2 fingers, axes x and y last.
 
-    `force` (T, 2, 2) [N] predicted at the samples, `measured` (T, 2, 2) [N] as recorded; `motion` is the
-    whole replay at 1 kHz, at times `t` [s].
+    `force` (T, 2, 2) [N] is predicted at the samples, `measured` (T, 2, 2) [N] recorded; `motion` is the
+    whole rollout at 1 kHz, at times `t` [s].
     """
 
     signals: Signals
@@ -149,7 +149,7 @@ class Replay:
 
     @property
     def predicted(self) -> dict[str, np.ndarray]:
-        """Predicted grip, net forces fx, fy and shear (T,) [N], as `Signals` has them measured."""
+        """Predicted grip, net forces fx, fy and shear (T,) [N], named as in `Signals`."""
         (fx1, fy1), (fx2, fy2) = (self.force[:, finger].T for finger in (0, 1))
         return {"grip": np.minimum(fx1, -fx2), "fx": fx1 + fx2, "fy": fy1 + fy2, "shear": (fy1 - fy2) / 2}
 
@@ -163,10 +163,9 @@ class Replay:
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            ) -> Replay:  # fmt: skip
-    """Drive the calibrated model with a recording's motion.
+    """Drive the calibrated model with the motion of a recording.
 
-    `boundaries` [s] between the subtasks say which block is where; without them the trial is
-    segmented.
+    `boundaries` [s] between the subtasks locate the blocks; without them the trial is segmented.
     """
     signals = task_space(trial, rig)
     if boundaries is None:
@@ -177,26 +176,32 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     position, velocity = (z @ TO_TIPS.T for z in path.at(t))
     constants = physics(rig, [blocks[name] for name in task.objects], surroundings)
     start = standing(constants, task, places(signals, path, task, np.asarray(boundaries)))
-    moved = [jnp.asarray(_padded(z).reshape(-1, 2, 2)) for z in (position, velocity)]
+    padding = ((0, -t.size % BUCKET), (0, 0))
+    moved = [jnp.asarray(np.pad(z, padding, "edge").reshape(-1, 2, 2)) for z in (position, velocity)]
     motion = rollout(constants, start, *moved, CONTROL_PERIOD, substeps_for(constants, CONTROL_PERIOD))
     motion = jax.tree.map(lambda a: np.asarray(a)[: t.size], motion)
-    force = np.stack([np.interp(signals.t, t, column) for column in motion.force.reshape(-1, 4).T], -1)
-    measured = np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], -1)
-    return Replay(signals, force.reshape(-1, 2, 2), measured.reshape(-1, 2, 2), t, motion)
+    force = interpolated(signals.t, t, motion.force)
+    return Replay(signals, force, _forces(signals).reshape(-1, 2, 2), t, motion)
+
+
+def _forces(signals: Signals) -> np.ndarray:
+    """Measured forces fx1, fy1, fx2, fy2 (T, 4) [N]."""
+    return np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], 1)
 
 
 def finger_motion(signals: Signals) -> Motion:
-    """Smoothed motion in x, y, distance, offset: in a grip the last two rest while the hand moves."""
-    pick = lambda names: np.stack([getattr(signals, name) for name in names], 1)  # noqa: E731
-    scale = np.sqrt([1.0, 1.0, 4.0, 4.0])  # sd_* are those of a mean of two; differences have twice
-    return smooth(signals.t, pick(("x", "y", "distance", "offset")),
-                  np.stack([signals.vx, signals.vy, signals.vx2 - signals.vx1, signals.vy2 - signals.vy1], 1),
-                  pick(("sd_x", "sd_y", "sd_x", "sd_y")) * scale,
-                  pick(("sd_vx", "sd_vy", "sd_vx", "sd_vy")) * scale)  # fmt: skip
+    """Smoothed motion in x, y, distance, offset: in a grip the last two are constant while the hand moves."""
+    s, scale = signals, np.sqrt([1.0, 1.0, 4.0, 4.0])  # sd_* are those of a mean; differences have twice them
+    position = np.stack([s.x, s.y, s.distance, s.offset], 1)
+    velocity = np.stack([s.vx, s.vy, s.vx2 - s.vx1, s.vy2 - s.vy1], 1)
+    sd_position, sd_velocity = (
+        np.stack(sds * 2, 1) * scale for sds in ([s.sd_x, s.sd_y], [s.sd_vx, s.sd_vy])
+    )
+    return smooth(s.t, position, velocity, sd_position, sd_velocity)
 
 
 def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarray) -> dict[str, float]:
-    """Where every block stands at first [m]: where it is first gripped, or first built upon."""
+    """Where every block stands initially [m]: where it is first gripped, or first built upon."""
     x: dict[str, float] = {}
     moved: set[str] = set()
 
@@ -212,7 +217,7 @@ def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarr
         if move.to != GROUND and move.to not in moved and not move.slide:
             x.setdefault(move.to, during(meet, part))
         moved.add(move.object)
-    for _ in task.objects:  # blocks of one pile stand over one another
+    for _ in task.objects:  # the blocks of a pile stand above one another
         for name, on in task.initial.items():
             if on != GROUND and name in x:
                 x.setdefault(on, x[name])
@@ -223,17 +228,13 @@ def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarr
     return x
 
 
-def _padded(rows: np.ndarray) -> np.ndarray:
-    return np.pad(rows, ((0, -len(rows) % BUCKET), (0, 0)), "edge")
-
-
 def residual_summary(
     result: Replay, boundaries: Sequence[float] | np.ndarray, states: Sequence[str]
 ) -> dict[str, float]:
     """Root mean square of the net force residual over its noise, by contact state.
 
-    `states` are those of the subtasks between the `boundaries` [s]; samples within 0.1 s of one
-    are left out. The noise of a net force is sqrt(2) times the sensor's.
+    `states` are those of the subtasks between the `boundaries` [s]; samples within 0.1 s of a boundary are
+    left out. The noise of a net force is sqrt(2) times the sensor's.
     """
     t, net = result.signals.t, result.residual.sum(axis=1) / (np.sqrt(2) * result.signals.sd_force)
     edges = np.concatenate([[t[0] - 1], boundaries, [t[-1] + 1]])
@@ -247,28 +248,28 @@ def residual_summary(
     return out
 
 
-# A recorded performance once more: commands under which a hand moves and presses as it did.
+# A recorded performance repeated: commands under which a simulated hand moves and presses as recorded.
 #
-# What a healthy recording of just this operator would show, whatever its profile of speed, pace, grip and
-# order of fingers: without a model of a person. The tips follow the smoothed recorded motion; where
-# they touch, the command lies beyond it by what the recorded force takes (impedance control, as
-# `simgap.world.dynamics` has it).
+# They give what a healthy recording of this very operator would show, with its profile of speed, pace, grip
+# and order of fingers, without a model of a person. The tips follow the smoothed recorded motion; in contact
+# the command lies beyond it by what the recorded force requires (impedance control, as in
+# `simgap.world.dynamics`).
 
-# chosen: kg, N/m, damping ratio. Stiff, so that tips keep to the recorded motion; no stiffer, so that noise
-# of positions makes little force through pads of any stiffness.
+# chosen: kg, N/m, damping ratio. Stiff enough for the tips to keep to the recorded motion, and soft enough
+# for position noise to make little force through pads of any stiffness.
 MASS, STIFFNESS, DAMPING = 0.1, 2000.0, 1.0
-# numerics: sd of the commands' smoothing, in sample intervals: what wavers between samples is noise
+# numerics: sd of the commands' smoothing in sample intervals: faster fluctuations are noise
 BETWEEN = 0.5
-QUICKEST = 0.01  # prior: s; the least of it: no hand commands more quickly
-HEARD = 3.0  # chosen: sds of noise that a force must have to be one
+QUICKEST = 0.01  # prior: s; the least such sd, as no hand commands faster
+HEARD = 3.0  # chosen: sds of noise above which a force is real
 
 
 def plan_again(
     signals: Signals, task: BlockTask, blocks: Blocks, boundaries: Sequence[float], force_sd: float
 ) -> Plan:
-    """Commands for one performance as recorded, with its `boundaries` [s] between the subtasks.
+    """Plan a performance as recorded, with its `boundaries` [s] between the subtasks.
 
-    `force_sd` [N]: noise of one sample of force. ValueError where noise of positions is not known.
+    `force_sd` [N] is the noise of one force sample. ValueError if the noise of positions is unknown.
     """
     path = finger_motion(signals)
     if not np.isfinite(path.position).all():
@@ -288,16 +289,16 @@ def plan_again(
 
 
 def _load(signals: Signals, sd: float, t: np.ndarray) -> np.ndarray:
-    """Smoothed forces (len(t), 4) of the tips x1, y1, x2, y2 [N]; none where only noise is."""
-    force = np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], 1)
+    """Smoothed forces (len(t), 4) [N] of the tips x1, y1, x2, y2; zero where they are within the noise."""
+    force = _forces(signals)
     unknown, noise = np.full_like(force, np.nan), np.full_like(force, sd)
     smoothed = smooth(signals.t, force, unknown, noise, noise)
     load = np.where(np.abs(smoothed.position) > HEARD * smoothed.sd, smoothed.position, 0.0)
-    return np.stack([np.interp(t, signals.t, column) for column in load.T], 1)
+    return interpolated(t, signals.t, load)
 
 
 def _windows_of(task: BlockTask, boundaries: np.ndarray) -> tuple[Window, ...]:
-    """When the moves were commanded, from the four boundaries [s] of each."""
+    """Command times of the moves, from the four boundaries [s] of each."""
     out, before = [], 0.0
     for k, move in enumerate(task.performed):
         touch, leave, meet, part = boundaries[4 * k : 4 * k + 4]

@@ -1,4 +1,4 @@
-"""Complete synthetic trials: an operator performs a task, sensors record it, contacts give the truth."""
+"""Synthetic trials: an operator performs a task, sensors record it, and contacts give the truth."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ from simgap.world.dynamics import (
     Physics,
     Record,
     State,
+    interpolated,
     perform,
     resting_state,
 )
@@ -39,20 +40,20 @@ from simgap.world.operator import OperatorSettings, Plan, Window, plan
 from simgap.world.properties import UNITS, Blocks, blocks_table
 from simgap.world.virtual_model import Surroundings, physics, substeps_for
 
-# What the hand's sensors record of a true motion: samples at a rate, with the rig's noise.
+# What the hand's sensors record of a true motion: samples with the rig's noise.
 
 DEFAULT_RATE = 20.0  # cited: Hz, the paper's
-# prior: standard deviations of one sample where a rig leaves them to be learned: rad, m, rad/s, N
+# prior: sd of one sample if the rig leaves it to be learned: rad, m, rad/s, N
 DEFAULT_NOISE = {"angle": 2e-4, "position": 3e-5, "velocity": 0.03, "force": 0.012}
 DEFAULT_CARTESIAN_VELOCITY = 0.004  # prior: m/s
 
 
 def record(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig,
            rng: np.random.Generator | None, file: str) -> Trial:  # fmt: skip
-    """Trial sampled at times t (num_timesteps,) from tips (num_timesteps, 2 fingers, 2 axes).
+    """Record tips (num_timesteps, 2 fingers, 2 axes) at times t (num_timesteps,) [s].
 
-    Positions [m], velocities [m/s], forces [N] on the environment. Noise of the rig from `rng`,
-    none where that is None. InputError where a tip is out of the hand's reach.
+    Positions [m], velocities [m/s], forces [N] on the environment. Noise as in the rig is drawn from `rng`
+    (none if None). InputError if a tip is beyond the hand's reach.
     """
     channels: dict[str, np.ndarray] = {}
 
@@ -88,17 +89,17 @@ def noise_sd(rig: Rig, quantity: str) -> float:
     return DEFAULT_NOISE[quantity]
 
 
-BATCH, SMALL = 16, 4  # numerics: trials integrated side by side: so many, or few
-MOVING = 2e-3  # physics: a definition: m/s; a slide begins and ends where the block's speed passes this
+BATCH, SMALL = 16, 4  # numerics: trials integrated together, if there are many or few
+MOVING = 2e-3  # physics: a definition: m/s; a slide begins and ends where the block passes this speed
 
 
 @dataclass(frozen=True, repr=False)
 class SimulatedTrial(Tabled):
     """A synthetic recording with its truth.
 
-    `trial` is as read from a file. `boundaries` (num_subtasks - 1,) [s] are the times between the
-    subtasks, from the contacts (NaN where one never happened: a dropped block). `motion` is what truly
-    happened, one row per millisecond at times `t` [s], blocks in the order of `blocks`. `rig` recorded it.
+    `trial` is the recording, as read from a file. `boundaries` (num_subtasks - 1,) [s] are the times between
+    the subtasks, from the contacts (NaN if one never happened, as with a dropped block). `motion` is the true
+    motion, one row per millisecond at times `t` [s], with blocks in the order of `blocks`. `rig` recorded it.
     """
 
     trial: Trial
@@ -118,7 +119,7 @@ class SimulatedTrial(Tabled):
         return known(self.trial.file, self.trial.rate, subtasks(self.task), edges, recorded=recorded)
 
     def to_json(self) -> dict[str, Any]:
-        """The entry of one trial in the JSON of `simulate`, but for the name of its file."""
+        """The entry of one trial in the JSON of `simulate`, except for its file name."""
         return {"seed": self.seed, "rate": self.trial.rate, "boundaries": self.boundaries}
 
     def tables(self) -> list[Any]:
@@ -126,18 +127,8 @@ class SimulatedTrial(Tabled):
         return [spans_table(self.segmentation), blocks_table(self.blocks)]
 
     def plot(self, path: str | Path | None = None) -> list[Any]:
-        """Recorded signals over the true subtasks; the axes. Saved where a path is given."""
+        """Plot recorded signals over the true subtasks, to `path` if given; the axes."""
         return self.segmentation.plot(path)
-
-
-def simulate_trial(task: BlockTask, rig: Rig, properties: Blocks, seed: int,
-                   operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
-                   ) -> SimulatedTrial:  # fmt: skip
-    """One performance of a task with blocks of known properties, drawn from `seed`.
-
-    InputError where a block is missing or the hand cannot reach that far.
-    """
-    return simulate_trials(task, rig, [properties], [seed], operator, surroundings)[0]
 
 
 @double_precision
@@ -145,10 +136,11 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
                     operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
                     alter: Callable[[Plan, np.random.Generator], Plan] | None = None,
                     ) -> list[SimulatedTrial]:  # fmt: skip
-    """Many performances at once, one for each seed with its blocks; each as `simulate_trial` gives it.
+    """Several performances of a task, one for each seed with its blocks of known properties.
 
-    They are integrated side by side, which costs far less than one after another. `alter` changes what
-    the operator commands, by a generator of its own.
+    They are integrated together, which costs far less than one after another, with the same result. `alter`
+    changes the operator's commands, given a random generator of its own. InputError if a block is missing or
+    out of the hand's reach.
     """
     settings = operator or OperatorSettings()
     if not seeds:
@@ -168,7 +160,7 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
 def simulate_plans(task: BlockTask, rig: Rig, plans: Sequence[Plan], properties: Sequence[Blocks],
                    seeds: Sequence[int], surroundings: Surroundings | None = None,
                    ) -> list[SimulatedTrial]:  # fmt: skip
-    """What becomes of given commands, each with its blocks; sensors' noise from the seeds."""
+    """Perform given plans, each with its blocks; sensor noise is drawn from the seeds."""
     scenes = [physics(rig, [blocks[name] for name in task.objects], surroundings) for blocks in properties]
     substeps = max(substeps_for(scene, CONTROL_PERIOD) for scene in scenes)
     length = -(-max(len(p.command) for p in plans) // BUCKET) * BUCKET
@@ -183,7 +175,7 @@ def simulate_plans(task: BlockTask, rig: Rig, plans: Sequence[Plan], properties:
 
 def _perform_all(task: BlockTask, plans: Sequence[Plan], scenes: Sequence[Physics], length: int,
                  substeps: int) -> list[Record]:  # fmt: skip
-    """Records of one batch; one of several is filled up to SMALL or BATCH, so that two programs serve all."""
+    """Records of one batch, padded to 1, SMALL or BATCH trials so that three programs serve all sizes."""
     hands = [Impedance(*map(jnp.asarray, p.impedance)) for p in plans]
     commands = [np.pad(p.command, ((0, length - len(p.command)), (0, 0)), "edge") for p in plans]
     starts = [_start(scene, task, p) for scene, p in zip(scenes, plans, strict=True)]
@@ -209,28 +201,22 @@ def _start(scene: Physics, task: BlockTask, performance: Plan) -> State:
 
 def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks: Blocks,
            seed: int) -> SimulatedTrial:  # fmt: skip
+    """The recording and the truth of a performance, from its rollout `motion`."""
     n = len(performance.command)
     motion = jax.tree.map(lambda a: a[:n], motion)
     fine = np.arange(n) * CONTROL_PERIOD
     rate = rig.rate or DEFAULT_RATE
     t = np.arange(int(round(performance.duration * rate, 6))) / rate
-    place, speed, force = (
-        _at(t, fine, values) for values in (motion.position, motion.velocity, motion.force)
-    )
+    place, speed, force = (interpolated(t, fine, z) for z in (motion.position, motion.velocity, motion.force))
     trial = record(t, place, speed, force, rig, np.random.default_rng([seed, 2]), f"simulated, seed {seed}")
     order = {name: k for k, name in enumerate(task.objects)}
     truth = [time for w in performance.windows for time in _boundaries(w, order[w.object], fine, motion)]
     return SimulatedTrial(trial, np.array(truth), fine, motion, blocks, seed, task, rig)
 
 
-def _at(t: np.ndarray, fine: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Values at sampling times, linear between milliseconds."""
-    flat = values.reshape(len(fine), -1)
-    return np.stack([np.interp(t, fine, column) for column in flat.T], 1).reshape(t.size, *values.shape[1:])
-
-
 def _boundaries(window: Window, block: int, t: np.ndarray, motion: Record) -> list[float]:
-    """The four times [s] of a move: both touch, leaves (or slides), meets (or stops), one lets go."""
+    """The four times [s] of a move: both fingers touch, it leaves (or slides), meets (or stops), one lets
+    go."""
     gripped = (motion.pads[:, :, block] > 0).all(axis=1)
     early, late = (t >= window.lift) & (t < window.middle), (t >= window.middle) & (t < window.end)
     if window.slide:
@@ -248,17 +234,17 @@ def _boundaries(window: Window, block: int, t: np.ndarray, motion: Record) -> li
 
 
 def _first(t: np.ndarray, there: np.ndarray) -> float:
-    """Time of the first true entry; NaN where there is none."""
+    """Time of the first true entry; NaN if none is true."""
     return float(t[np.argmax(there)]) if there.any() else np.nan
 
 
-# Synthetic trials as texts of files: rig, task, actual properties, trials and their truth.
+# Synthetic trials as file contents: rig, task, actual properties, trials and their truth.
 
 DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals by a channel's first letter
 
 
 def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
-    """Texts of rig.toml, task.toml and actual.toml by file name."""
+    """Contents of rig.toml, task.toml and actual.toml by file name."""
     actual = {
         name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
         for name in task.objects
@@ -268,14 +254,15 @@ def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
 
 
 def trial_files(number: int, trial: Trial, boundaries: np.ndarray, seed: int) -> dict[str, str]:
-    """Texts of one trial and its truth (boundaries [s], null where one never happened) by file name."""
+    """Contents of one trial and its truth (boundaries [s], null if one never happened) by file name."""
     times = [round(float(b), 6) if np.isfinite(b) else None for b in boundaries]
     truth = json.dumps({"boundaries": times, "seed": int(seed)})
     return {f"trial_{number:02d}.csv": trial_csv(trial), f"truth/trial_{number:02d}.json": truth + "\n"}
 
 
 def trial_csv(trial: Trial) -> str:
-    """A trial as CSV text: t and the hand's channels, rounded below the sensors' noise; empty if missing."""
+    """A trial as CSV: t and the hand's channels, rounded below the sensors' noise; missing samples are
+    empty."""
     rows = [f"{t:.6f}" for t in trial.t]
     for name, values in trial.channels.items():
         digits = DIGITS[name[0]]
@@ -285,7 +272,7 @@ def trial_csv(trial: Trial) -> str:
 
 
 def task_table(task: BlockTask) -> dict[str, Any]:
-    """The table of `task.toml` that describes a task."""
+    """The content of `task.toml` that describes a task."""
     moves = [{"object": m.object, "to": m.to} | ({"slide": True} if m.slide else {}) for m in task.moves]
     table: dict[str, Any] = {} if task.repeat == 1 else {"repeat": task.repeat}
     return table | {"objects": {name: {"on": on} for name, on in task.initial.items()}, "moves": moves}

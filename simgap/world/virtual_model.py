@@ -1,7 +1,7 @@
-"""The virtual model driven by fingers whose motion is given: one step at a time, or a whole rollout.
+"""The virtual model driven by given finger motions, one step at a time or as a whole rollout.
 
-`advance` and `rollout` are pure and differentiable; `VirtualModel` keeps the state between the
-steps of a haptic loop.
+`advance` and `rollout` are pure and differentiable; `VirtualModel` keeps the state between the steps of a
+haptic loop.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from simgap.world.dynamics import (
 )
 from simgap.world.properties import Block, Blocks, standing_heights
 
-# The calibrated scene: constants of the dynamics from a rig and blocks, and its fastest mode.
+# The calibrated scene: the constants of the dynamics, and the substeps that its fastest mode needs.
 
 RIGID_PAD = 1e5  # numerics: N/m in place of inf: 3 N of grip compress such a pad by 0.03 mm
 
@@ -47,8 +47,8 @@ RIGID_PAD = 1e5  # numerics: N/m in place of inf: 3 N of grip compress such a pa
 class Surroundings:
     """What a rig does not state: supports and the foam's damping.
 
-    Supports are stiff springs [N/m] with damping (ratio to critical, one block) and friction;
-    the foam's damping is its time constant [s], damping over stiffness; the ground's `tilt` [rad].
+    Supports are stiff springs [N/m] with damping (ratio to critical for one block) and friction. The foam's
+    damping is given by `pad_time` [s], damping over stiffness, and the ground's slope by `tilt` [rad].
     """
 
     support_stiffness: float = 4e5
@@ -59,9 +59,8 @@ class Surroundings:
 
 
 def physics(rig: Rig, blocks: Sequence[Block], surroundings: Surroundings | None = None) -> Physics:
-    """Constants of the dynamics for blocks in order; a rigid pad becomes one of RIGID_PAD."""
+    """Constants of the dynamics for blocks in order; a rigid pad gets the stiffness RIGID_PAD."""
     around = surroundings or Surroundings()
-
     normal, shear = map(finite_stiffness, (rig.fingertip.normal_stiffness, rig.fingertip.shear_stiffness))
     sizes = {key: tuple(getattr(b, key) for b in blocks) for key in ("weight", "width", "height", "friction")}
     pads = {"pad_normal": (normal, normal), "pad_shear": (shear, shear)}
@@ -70,16 +69,16 @@ def physics(rig: Rig, blocks: Sequence[Block], surroundings: Surroundings | None
 
 
 def finite_stiffness(stiffness: float) -> float:
-    """A pad's stiffness [N/m], with the substitute for a rigid one."""
+    """A pad's stiffness [N/m], RIGID_PAD if it is rigid."""
     return stiffness if math.isfinite(stiffness) else RIGID_PAD
 
 
 def substeps_for(constants: Physics, period: float) -> int:
-    """Substeps in a period [s] that keep the integration well inside its stability limit.
+    """Number of substeps in a period [s] that keeps the integration well inside its stability limit.
 
-    By Gershgorin no block oscillates faster than sqrt((4 supports + both pads) / mass), as in the
-    middle of a stack. The step is held to 1.1 over that frequency (the limit is 2), to 0.8 over the
-    pads' damping rate and to 0.25 ms; a power of two, so that few programs are compiled.
+    By Gershgorin's theorem no block oscillates faster than sqrt((4 supports + both pads) / mass), the bound
+    in the middle of a stack. The step is at most 1.1 over that frequency (the limit is 2), 0.8 over the pads'
+    damping rate, and 0.25 ms. The number is a power of two, so that few programs are compiled.
     """
     step = 2.5e-4
     pads = max(sum(map(float, constants.pad_normal)), sum(map(float, constants.pad_shear)))
@@ -92,7 +91,7 @@ def substeps_for(constants: Physics, period: float) -> int:
 
 def advance(constants: Physics, state: State, before: Tips, after: Tips, dt: Scalar,
             substeps: int) -> tuple[State, Loads]:  # fmt: skip
-    """State and loads after dt [s] in which the tips go straight from one place to the next."""
+    """State and loads after dt [s] of straight tip motion."""
 
     def between(share: Scalar) -> Tips:
         return jax.tree.map(lambda a, b: a + share * (b - a), before, after)
@@ -106,8 +105,8 @@ def advance(constants: Physics, state: State, before: Tips, after: Tips, dt: Sca
 @partial(jax.jit, static_argnames=("substeps",))
 def rollout(constants: Physics, state: State, positions: Array, velocities: Array, dt: Scalar,
             substeps: int) -> Record:  # fmt: skip
-    """What happens from `state` on as fingers move through positions and velocities (T, 2, 2) [m, m/s] every
-    dt [s]."""
+    """Rollout from `state` as fingers move through positions and velocities (T, 2, 2) [m, m/s] every dt
+    [s]."""
 
     def one(carry: tuple[State, Tips], row: Array) -> tuple[tuple[State, Tips], Array]:
         state, before = carry
@@ -121,7 +120,7 @@ def rollout(constants: Physics, state: State, positions: Array, velocities: Arra
 
 
 def standing(constants: Physics, task: BlockTask, x: Mapping[str, float]) -> State:
-    """Blocks at rest as the task begins, each on its support, centres at x [m] by name."""
+    """Blocks at rest on their supports at the start of the task, centred at x [m] by name."""
     heights = dict(zip(task.objects, map(float, constants.height), strict=True))
     y = standing_heights(task.initial, heights)
     return resting_state(constants, [jnp.asarray(x[name], float) for name in task.objects],
@@ -129,10 +128,10 @@ def standing(constants: Physics, task: BlockTask, x: Mapping[str, float]) -> Sta
 
 
 class VirtualModel:
-    """A scene to touch: give finger motions step by step, get the forces to render.
+    """A scene to touch: takes finger motions step by step and returns the forces to render.
 
-    `blocks` in the order of `task.objects` stand as the task begins, centres at x [m] by name.
-    A program is compiled at the first step, or before it by `prepare`.
+    Blocks stand as at the start of the task, centred at x [m] by name. A program is compiled at the first
+    step, or earlier by `prepare`.
     """
 
     @double_precision
@@ -146,7 +145,7 @@ class VirtualModel:
         self.reset()
 
     def reset(self) -> None:
-        """Put every block back to where it started."""
+        """Return every block to its start."""
         self._state = self._start
         self._tips: np.ndarray | None = None
         self.energy = 0.0
@@ -158,15 +157,15 @@ class VirtualModel:
 
     @double_precision
     def step(self, finger_positions: ArrayLike, finger_velocities: ArrayLike, dt: float) -> np.ndarray:
-        """Move the fingers and advance the blocks; `energy` [J] is then that of blocks and contacts.
+        """Move the fingers, advance the blocks, and update `energy` [J] of blocks and contacts.
 
         Args:
-            finger_positions: (2, 2) [m], fingers 1 and 2, x and y, reached at the end of the step.
-            finger_velocities: (2, 2) [m/s], there.
+            finger_positions: (2, 2) [m] at the end of the step, fingers 1 and 2, x and y.
+            finger_velocities: (2, 2) [m/s] at the end of the step.
             dt: Period [s].
 
         Returns:
-            Forces (2, 2) [N] that the fingers exert; a haptic device renders the opposite.
+            Forces (2, 2) [N] exerted by the fingers; a haptic device renders the opposite.
 
         Raises:
             ValueError: A shape is wrong or a number is not finite.
@@ -186,11 +185,11 @@ class VirtualModel:
     @property
     @double_precision
     def state(self) -> State:
-        """Blocks and contacts now."""
+        """Current state of blocks and contacts."""
         return self._unravel(self._state)
 
     def block_positions(self) -> np.ndarray:
-        """Centres of the blocks (num_blocks, 2) [m] now."""
+        """Current centres of the blocks (num_blocks, 2) [m]."""
         n = len(self.objects)
         return np.asarray(self._state)[: 2 * n].reshape(2, n).T  # a State begins with x and y
 
@@ -203,7 +202,7 @@ class VirtualModel:
 
 @lru_cache
 def _program(num_blocks: int, substeps: int) -> Callable:
-    """Compiled step on flat arrays: few arguments are quick to hand over, and any scene can use it."""
+    """A compiled step on flat arrays, for any scene; few arguments make the call fast."""
     block = [Block(1.0, 1.0, 1.0)] * num_blocks
     template = physics(Rig(), block)
     _, constants_of = ravel_pytree(template)

@@ -16,7 +16,7 @@ from scipy.stats import norm
 from estimation import identify
 from estimation.consistency import SIZE, WELL_MADE, WRONG, Tie
 from hmmseg.hand.read import read_trial
-from hmmseg.hand.sensing import sensed
+from hmmseg.hand.sensing import remove_faults
 from hmmseg.io.formats import read_table
 from hmmseg.io.rig import read_rig
 from hmmseg.io.trial import trial_of
@@ -174,7 +174,7 @@ def test_a_width_below_nothing_is_none_and_the_weights_stay():
 def test_healthy_recordings_show_no_fault():
     for path in sorted(FOLDER.parent.glob("*/trial_*.csv")):
         rig = read_rig(path.parent / "rig.toml")
-        assert sensed(trial_of(read_table(path), rig, None), rig).faults == ()
+        assert remove_faults(trial_of(read_table(path), rig, None), rig).faults == ()
 
 
 @pytest.mark.parametrize("step", [0.02, 0.05, 0.2])

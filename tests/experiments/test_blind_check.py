@@ -15,10 +15,9 @@ from experiments.blind_check.generate import NOMINAL, generate  # noqa: E402
 from experiments.blind_check.hand import angles, load_rig, rates, tips  # noqa: E402
 from experiments.blind_check.operator import Style, plan  # noqa: E402
 from experiments.blind_check.perform import SETTLE, perform  # noqa: E402
-from experiments.blind_check.scene import PIVOT, STEP, Block, Servo, World, mjcf  # noqa: E402
+from experiments.blind_check.scene import PIVOT, STEP, TASKS, Block, Servo, World, mjcf  # noqa: E402
 from experiments.blind_check.sealing import BrokenSeal, unseal  # noqa: E402
 from experiments.blind_check.signals import Sampling, sample, sense  # noqa: E402
-from experiments.blind_check.tasks import TASKS  # noqa: E402
 from experiments.blind_check.worlds import draw_world, world_of  # noqa: E402
 from hmmseg.io.rig import read_rig  # noqa: E402
 from hmmseg.io.task import read_task  # noqa: E402

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from experiments.blind_check.judge import judge_case
-from experiments.blind_check.score import figures
-from experiments.blind_check.statistics import calibration
-from experiments.blind_check.tasks import TASKS
+from experiments.blind_check.scene import TASKS
+from experiments.blind_check.score import calibration, figures
 
 
 def entry(case: str, tier: str, effects: dict, size: float = 0.5, measured: bool = True) -> dict:

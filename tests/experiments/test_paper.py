@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from experiments.paper import estimates, rigid, slip, sources, states, tables, write_docs
+from experiments.paper import estimates, recording, rigid, slip, sources, tables, write_docs
 from experiments.saving import commit_of
 from hmmseg.plot import style as drawing
 from paper_figs import __main__ as figures
@@ -41,9 +41,9 @@ def test_pad_stiffness_and_width_follow_from_the_recordings_alone(case):
 
 
 def test_states_come_in_the_expected_order(case):
-    rows = states.trials(case)
-    assert all(row["ordered"] == list(states.EXPECTED) for row in rows)
-    assert rows[sources.ONE]["sequence"] == list(states.EXPECTED)
+    rows = recording.trials(case)
+    assert all(row["ordered"] == list(recording.EXPECTED) for row in rows)
+    assert rows[sources.ONE]["sequence"] == list(recording.EXPECTED)
     assert sum(row["flickers"] > 0 for row in rows) >= 1  # the weakness is there to be seen
 
 
@@ -80,7 +80,7 @@ def test_saved_numbers_are_those_of_the_recordings(case):
                 assert saved[which][name][key]["mean"] == pytest.approx(
                     fresh[which][name][key]["mean"], rel=1e-5
                 )
-    assert results.load("states")["recordings"] == json.loads(json.dumps(states.trials(case)))
+    assert results.load("states")["recordings"] == json.loads(json.dumps(recording.trials(case)))
 
 
 def test_the_page_is_rendered_from_the_results():

@@ -22,10 +22,10 @@ from hmmseg.sequence.courses import (
     seen,
 )
 from hmmseg.sequence.emissions import StudentEmissions, from_weights, independent_share
-from hmmseg.sequence.features import cell_means, edge_preserving_slopes, feature_map, features, without_old
+from hmmseg.sequence.features import cell_means, drop_repeats, edge_preserving_slopes, feature_map, features
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import NamedCourse, load_model, save_model
-from hmmseg.sequence.segment import _shortest, places, segment_sequence, together
+from hmmseg.sequence.segment import _shortest, mix, places, segment_sequence
 
 TASK = SequenceTask(("wait", "push", "pull"))
 
@@ -146,7 +146,7 @@ def test_boundaries_and_gain_from_the_joint_table_of_naming_and_label():
                 0.5, emissions, np.ones(changes + 1), named, np.array([[0.0], [3.0]] * np.ones(changes))
             )
         )
-    found = together(tables, courses, lag)
+    crossing, gains = mix(tables, courses, lag)
     offsets = np.arange(-40, 41)
     law = np.exp(-np.abs(offsets) / 1.5)
     law /= law.sum()
@@ -163,9 +163,9 @@ def test_boundaries_and_gain_from_the_joint_table_of_naming_and_label():
         mixed = joint.sum(0)
         alone = joint.sum(1, keepdims=True) * mixed
         gain = (joint * np.log(np.where(joint > 0, joint / np.where(joint > 0, alone, 1), 1))).sum()
-        assert found.gain[b] == pytest.approx(gain, rel=1e-3)
+        assert gains[b] == pytest.approx(gain, rel=1e-3)
         expected = (1 - WEIGHING.elsewhere) * mixed + WEIGHING.elsewhere / cells
-        np.testing.assert_allclose(found.crossing[:, b], expected, atol=1e-4)
+        np.testing.assert_allclose(crossing[:, b], expected, atol=1e-4)
 
 
 def test_places_are_what_lies_near_a_time():
@@ -278,12 +278,12 @@ def test_cells_average_samples_and_stay_empty_where_there_are_none():
 def test_readings_repeated_to_the_last_digit_are_old_ones():
     rng = np.random.default_rng(0)
     slow = rng.normal(size=40)
-    np.testing.assert_array_equal(without_old(np.repeat(slow, 4))[::4], slow)
-    assert np.isnan(without_old(np.repeat(slow, 4))).sum() == 120
+    np.testing.assert_array_equal(drop_repeats(np.repeat(slow, 4))[::4], slow)
+    assert np.isnan(drop_repeats(np.repeat(slow, 4))).sum() == 120
     again = np.repeat(np.r_[slow[:20], slow[19], slow[20:]], 4)  # a reading that is the same once more
-    assert np.isfinite(without_old(again)).sum() == 41
+    assert np.isfinite(drop_repeats(again)).sum() == 41
     for fresh in (slow, np.round(np.cumsum(rng.normal(size=200))), np.zeros(50)):  # quantised, constant
-        np.testing.assert_array_equal(without_old(fresh), fresh)
+        np.testing.assert_array_equal(drop_repeats(fresh), fresh)
 
 
 def test_features_do_not_depend_on_units():

@@ -15,8 +15,7 @@ from hmmseg.contact.equations import rolled_offset, turned
 from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, require_reach, tip_velocity
 from hmmseg.hand.read import read_trial
-from hmmseg.hand.roll import levelled
-from hmmseg.hand.signals import Signals, late_differences, one_sided, task_space, timely
+from hmmseg.hand.signals import Signals, late_differences, one_sided, remove_roll, task_space, timely
 from hmmseg.hand.tool import smooth
 from hmmseg.io.rig import Finger, Fingertip, Noise, Rig, parse_rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, ROLL, Trial
@@ -357,7 +356,7 @@ def test_equations_of_a_rolled_block():
 def test_a_recorded_roll_is_taken_out():
     rolled, _, _ = rolling_trial(76200, 0.05)
     level, _, _ = rolling_trial(76200, 0.0)
-    found = levelled(rolled)
+    found = remove_roll(rolled)
     for name in ("x1", "x2", "fx1", "fy1", "fx2", "fy2"):
         np.testing.assert_allclose(found.channels[name], level.channels[name], atol=1e-9)
     # The hand is higher by what the corner hangs lower; what the fingers differ by is as it was.
@@ -370,18 +369,18 @@ def test_no_hand_rolls_so_far(tmp_path):
     trial, rig, _ = rolling_trial(76200, 0.02)
     degrees = replace(trial, channels=trial.channels | {ROLL: np.degrees(trial.channels[ROLL])})
     with pytest.raises(InputError, match=r"column hand_roll: .* rad; expected radians, .* in degrees"):
-        levelled(degrees)
+        remove_roll(degrees)
     table = {"t": trial.t} | degrees.channels
     with pytest.raises(InputError, match="column hand_roll"):
         read_trial(table, rig)
     read = read_trial({"t": trial.t} | trial.channels, rig)
-    np.testing.assert_allclose(read.channels["fy1"], levelled(trial).channels["fy1"])
+    np.testing.assert_allclose(read.channels["fy1"], remove_roll(trial).channels["fy1"])
 
 
 def test_a_watcher_takes_the_roll_out_row_by_row():
     trial, rig, _ = rolling_trial(76200, 0.05)
     rolled, level = Watcher(scene()[1], rig), Watcher(scene()[1], rig)
-    names, flat = (*CARTESIAN_CHANNELS, ROLL), levelled(trial)
+    names, flat = (*CARTESIAN_CHANNELS, ROLL), remove_roll(trial)
     for k, t in enumerate(trial.t[:200]):
         rolled.update(t, [trial.channels[n][k] for n in names])
         level.update(t, [flat.channels[n][k] for n in CARTESIAN_CHANNELS])

@@ -12,7 +12,7 @@ import pytest
 import hmmseg
 from hmmseg.errors import InputError
 from hmmseg_cli import main as frame
-from hmmseg_cli.console import Output, described, distinct_trials, needed, strict_json
+from hmmseg_cli.console import Output, distinct_trials, find_inputs, require_rig, strict_json
 
 HMMSEG = Path(sys.executable).with_name("hmmseg")
 TASK = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
@@ -77,25 +77,25 @@ def test_usage_at_fault(capsys, args, line):
 def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
     trial, rig = tmp_path / "trial.csv", tmp_path / "rig.toml"
     trial.write_text("t\n")
-    assert described([trial], None, None) == (task, None)
+    assert find_inputs([trial], None, None) == (task, None)
     rig.write_text("rate = 50.0\n")
-    assert described([trial], None, None) == (task, rig)
+    assert find_inputs([trial], None, None) == (task, rig)
     other = tmp_path / "other.toml"
     other.write_text('sequence = ["approach", "press"]\n')
-    assert described([trial], other, None) == (other, None)  # a plain task needs no hand
+    assert find_inputs([trial], other, None) == (other, None)  # a plain task needs no hand
     hand = rig.read_text()
     rig.write_text('[columns]\nt = {from = "time"}\n')  # but how its files are read, as inspect writes it
-    assert described([trial], other, None) == (other, rig)
+    assert find_inputs([trial], other, None) == (other, rig)
     rig.write_text(hand)
     with pytest.raises(InputError, match=r"--task .*rig.toml: describes no task; .*swapped\?"):
-        described([trial], rig, task)
+        find_inputs([trial], rig, task)
     with pytest.raises(InputError, match=r"--rig .*other.toml: describes a task"):
-        described([trial], task, other)
+        find_inputs([trial], task, other)
     task.unlink()
     with pytest.raises(InputError, match=r"--task: missing; expected .*or a task.toml in"):
-        described([trial], None, None)
+        find_inputs([trial], None, None)
     with pytest.raises(InputError, match="--rig: missing"):
-        needed(None, [trial])
+        require_rig(None, [trial])
 
 
 def test_help_groups_commands_and_gives_examples(capsys):

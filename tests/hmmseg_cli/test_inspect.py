@@ -31,7 +31,7 @@ from experiments.wrist_scene import Setup, performances, wrist_recording
 from hmmseg.hand.inspect import inspect, propose
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
-from hmmseg.io.table import plain_table
+from hmmseg.io.table import make_table
 from hmmseg.io.task import read_task
 from hmmseg_cli.main import main
 
@@ -103,7 +103,7 @@ def test_a_log_and_a_file_of_several(tmp_path, capsys):
 @pytest.mark.parametrize("case", ["none_1", "paper_blocks"])
 def test_nothing_is_proposed_where_nothing_is_needed(case):
     found = inspect(NONE.parent / case / "trial_01.csv")
-    assert (found.mapping, found.said) == ({}, ())
+    assert (found.mapping, found.remarks) == ({}, ())
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_nothing_is_proposed_where_nothing_is_needed(case):
     ],
 )  # fmt: skip
 def test_names_taken_apart(names, expected):
-    table = plain_table("a", {name: np.zeros(9) for name in names})
+    table = make_table("a", {name: np.zeros(9) for name in names})
     assert {ours: fields["from"] for ours, fields in propose(table).items()} == expected
 
 

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from hmmseg.example import example_folder
-from hmmseg_cli.main import heard, main
+from hmmseg_cli.main import main, repeat_interrupts
 
 STACK = Path(__file__).parents[1] / "data/stack"
 HAND = ["--task", "task.toml", "--rig", "rig.toml"]
@@ -333,7 +333,7 @@ def test_ctrl_c_in_a_callback_is_heard(capsys):
     # As a command has it, whatever ran before.
     usual = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with pytest.raises(KeyboardInterrupt), heard():
+        with pytest.raises(KeyboardInterrupt), repeat_interrupts():
             called()
             for _ in range(100):
                 time.sleep(0.05)

@@ -89,7 +89,7 @@ def test_bad_rows_can_be_left_out(run):
 
 def test_the_live_picture_shows_where_the_task_is():
     watcher = Watcher(COMMAND[2], COMMAND[4])
-    live = Live(watcher, lines=False)
+    live = Live(watcher)
     live._console.file = io.StringIO()
     for row in ROWS[1:60]:
         t, *values = map(float, row.split(","))

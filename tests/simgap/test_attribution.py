@@ -7,12 +7,21 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
-from simgap.attribution.attribute import _examined, _predicting, attribute, noise_of
-from simgap.attribution.heldout import Heldout, scatter_between
+from simgap.attribution.attribute import _examined, _needed, _predicting, attribute, noise_of
+from simgap.attribution.heldout import RESPONSE, Heldout, scatter_between
 from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
-from simgap.attribution.problem import Candidate, Gap, Rows, cosines
-from simgap.attribution.search import detected, leniently, sought, statistic, weights
-from simgap.attribution.verdict import ALARM, Explanation, acting, conclude, known, probabilities, significant
+from simgap.attribution.problem import MODELLED, Candidate, Gap, Rows, cosines
+from simgap.attribution.search import Detection, detected, leniently, sought, statistic, weights
+from simgap.attribution.verdict import (
+    ALARM,
+    RECORD,
+    Explanation,
+    acting,
+    conclude,
+    known,
+    probabilities,
+    significant,
+)
 
 
 def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
@@ -194,7 +203,7 @@ def test_one_effect_is_named_with_its_size_and_share():
 
 
 def test_rounding_makes_no_probability_larger_than_one():
-    gap = gap_of({1: 3.0})
+    gap = gap_of({1: 9.0})
     one = fitted(forms(gap), (1,))
     several = next(n for n in range(2, 99) if sum(weights([one] * n)) > 1.0)
     assert attribute(gap, heldout=False, models=[one] * several).effects["b"].probability == 1.0
@@ -430,6 +439,43 @@ def test_what_a_set_is_not_known_to_explain_is_unknown():
     sets = [one("a", 0.8, 0.25), one("b", 0.2, 0.5)]
     assert probabilities(sets, SURE)["unknown"] == pytest.approx(0.8 * 0.75 + 0.2 * 0.5)
     assert conclude(sets, SURE).verdict == "unknown"
+
+
+def test_probabilities_told_are_as_often_right_as_they_say():
+    named = conclude([one("a", 0.7), one("ab", 0.2), one("", 0.1)], SURE).probabilities
+    assert sum(named.values()) == pytest.approx(1.0)
+    assert named["a"] == pytest.approx(0.7 * RECORD) and named["unknown"] == pytest.approx(1 - 0.9 * RECORD)
+    # Without an alarm: even odds beforehand, times a Bayes factor of 1/4 for a gap.
+    quiet = Detection(-float(np.log(4.0)), 1.0, 0.0)
+    assert quiet.unseen == pytest.approx(0.2) and Detection(3.0, 0.1, 0.0).unseen == 0.5
+    told = conclude([one("", 1.0)], quiet.p_value, unseen=quiet.unseen)
+    assert told.verdict == "none" and told.probabilities["none"] == pytest.approx(0.8 / (1 + ALARM))
+
+
+@pytest.mark.parametrize(("form", "needed"), [(MODELLED, False), (RESPONSE, True)])
+def test_a_small_cause_beside_a_large_one_is_needed_where_the_form_of_the_large_one_is_exact(form, needed):
+    gap = gap_of({0: 60.0, 2: 2.5})
+    large, *others = gap.candidates
+    f = forms(replace(gap, candidates=(replace(large, form=form), *others)))
+    both, alone = fitted(f, (0, 2)), fitted(f, (0,))
+    speaks = both.score - fitted(f, ()).score
+    assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks
+    assert _needed(f, both, 2) == needed
+
+
+def test_a_scattering_cause_gains_more_than_the_forms_of_the_others_may_feign():
+    rows = rows_of(samples=40)
+    rng, extra = np.random.default_rng(3), np.where(rows.channel == 1, 8.0, 0.0)
+    column = np.where(rows.channel == 0, 1.0, 0.0)[:, None]
+    nothing = np.zeros(0)
+    noisy = Candidate("noisy", (), nothing, nothing, nothing, np.zeros(extra.size),
+                      np.zeros((extra.size, 0)), nothing, nothing, extra)  # fmt: skip
+    residual = rng.standard_normal(extra.size) * np.sqrt(1 + extra)
+    for size, causes in ((3.0, (0, 1)), (60.0, (0,))):
+        gap = Gap(rows, residual + size * column[:, 0], np.zeros((extra.size, 0)),
+                  (linear("shift", column, 10.0), noisy))  # fmt: skip
+        held = Heldout.of(forms(gap), np.ones(3), (0, 1))
+        assert held is not None and held.gain((0, 1), (0,)) > 100 and _predicting(held, (0, 1)) == causes
 
 
 def test_at_the_alarm_level_a_gap_is_as_likely_as_none():

@@ -12,11 +12,11 @@ mujoco = pytest.importorskip("mujoco")
 from simgap.robot_effects import UNMEASURED, candidates, effects_of  # noqa: E402
 from simgap.robot_effects.base import Setting  # noqa: E402
 from simgap.robots.model import Composed  # noqa: E402
+from simgap.robots.patch import patched  # noqa: E402
 from simgap.robots.rows import noises  # noqa: E402
 from simgap.simulators.mjcf.engine import rollout, warned  # noqa: E402
 from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
 from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
-from simgap.simulators.mjcf.patch import patched  # noqa: E402
 from simgap.simulators.mjcf.runs import (  # noqa: E402
     Held,
     _carried_out,

@@ -9,9 +9,9 @@ import pytest
 
 from hmmseg.errors import InputError
 from hmmseg_cli.console import Output
-from hmmseg_cli.diagnose_robot import show_stages
 from hmmseg_cli.main import main
 from hmmseg_cli.pages import Setting, _parameters
+from hmmseg_cli.robot import show_stages
 from simgap.report.robot import Course, Own, compared, history, intervals, motion_csv, write_rerun
 from simgap.simulators.recording import Recording
 

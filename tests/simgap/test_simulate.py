@@ -5,14 +5,15 @@ import pytest
 from simgap_scenes import HAND as RIG
 from simgap_scenes import STACK
 
+from experiments.worlds import random_properties
 from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Finger, Noise, Rig
 from hmmseg.io.task import GROUND, BlockTask, Move
 from simgap.world.operator import OperatorSettings, minimum_jerk
-from simgap.world.properties import PAPER_BLOCKS, Block, random_properties, read_properties
-from simgap.world.simulate import simulate_trial, simulate_trials
+from simgap.world.properties import PAPER_BLOCKS, Block, read_properties
+from simgap.world.simulate import simulate_trials
 
 TOWER = BlockTask({"a": "b", "b": "c", "c": GROUND}, (Move("a", GROUND), Move("b", "a"), Move("c", "b")))
 SLIDE = BlockTask({"a": GROUND, "b": GROUND}, (Move("a", GROUND, slide=True), Move("b", "a")))
@@ -20,7 +21,7 @@ SLIDE = BlockTask({"a": GROUND, "b": GROUND}, (Move("a", GROUND, slide=True), Mo
 
 @pytest.fixture(scope="module")
 def stacked():
-    return simulate_trial(STACK, RIG, PAPER_BLOCKS, seed=3)
+    return simulate_trials(STACK, RIG, [PAPER_BLOCKS], [3])[0]
 
 
 def test_a_trial_shows_its_task(stacked):
@@ -62,7 +63,7 @@ def test_sensors_add_the_rig_s_noise(stacked):
 
 
 def test_a_seed_gives_one_trial_and_another_seed_another(stacked):
-    again = simulate_trial(STACK, RIG, PAPER_BLOCKS, seed=3)
+    again = simulate_trials(STACK, RIG, [PAPER_BLOCKS], [3])[0]
     np.testing.assert_array_equal(again.trial.channels["fx1"], stacked.trial.channels["fx1"])
     together = simulate_trials(STACK, RIG, [PAPER_BLOCKS] * 3, [4, 3, 5])
     np.testing.assert_allclose(together[1].motion.force, stacked.motion.force, atol=1e-9)
@@ -72,7 +73,7 @@ def test_a_seed_gives_one_trial_and_another_seed_another(stacked):
 @pytest.mark.parametrize("task", [TOWER, SLIDE])
 def test_any_task_ends_as_described(task):
     blocks = random_properties(task, 1)
-    done = simulate_trial(task, RIG, blocks, seed=1)
+    done = simulate_trials(task, RIG, [blocks], [1])[0]
     assert np.isfinite(done.boundaries).all()
     assert (np.diff(done.boundaries) > 0).all()
     support = dict(task.initial) | {move.object: move.to for move in task.performed}
@@ -85,7 +86,7 @@ def test_any_task_ends_as_described(task):
 
 
 def test_a_slide_moves_the_block_along_the_ground_between_its_boundaries():
-    done = simulate_trial(SLIDE, RIG, random_properties(SLIDE, 2), seed=2)
+    done = simulate_trials(SLIDE, RIG, [random_properties(SLIDE, 2)], [2])[0]
     start, stop = done.boundaries[1:3]
     x, y = done.motion.blocks[:, 0, 0], done.motion.blocks[:, 0, 1]
     before, after = (x[np.searchsorted(done.t, time)] for time in (start, stop))
@@ -96,12 +97,12 @@ def test_a_slide_moves_the_block_along_the_ground_between_its_boundaries():
 
 def test_a_grip_that_cannot_hold_is_no_silent_success():
     slippery = {name: Block(b.weight, b.width, b.height, friction=0.02) for name, b in PAPER_BLOCKS.items()}
-    assert np.isnan(simulate_trial(STACK, RIG, slippery, seed=0).boundaries).any()
+    assert np.isnan(simulate_trials(STACK, RIG, [slippery], [0])[0].boundaries).any()
 
 
 def test_a_cartesian_hand_records_positions():
     rig = Rig(rate=100.0, fingertip=RIG.fingertip, noise=Noise(position=1e-5, velocity=1e-3, force=0.01))
-    done = simulate_trial(STACK, rig, PAPER_BLOCKS, seed=0)
+    done = simulate_trials(STACK, rig, [PAPER_BLOCKS], [0])[0]
     assert set(done.trial.channels) >= {"x1", "vy2", "fx1"}
     assert done.trial.rate == pytest.approx(100.0)
 
@@ -123,12 +124,12 @@ def test_properties_come_from_the_json_of_identify(tmp_path):
 
 def test_what_cannot_be_performed_is_refused():
     with pytest.raises(InputError, match="'block2' is missing"):
-        simulate_trial(STACK, RIG, {"block1": PAPER_BLOCKS["block1"]}, seed=0)
+        simulate_trials(STACK, RIG, [{"block1": PAPER_BLOCKS["block1"]}], [0])[0]
     with pytest.raises(ValueError, match=r"grip\n.*expected \(low, high\), low <= high"):
         OperatorSettings(grip=(3.0, 1.0))
     short = {i: Finger(base=f.base, links=(0.08, 0.08)) for i, f in (RIG.fingers or {}).items()}
     with pytest.raises(InputError, match="finger 1"):
-        simulate_trial(STACK, RIG.model_copy(update={"fingers": short}), PAPER_BLOCKS, seed=0)
+        simulate_trials(STACK, RIG.model_copy(update={"fingers": short}), [PAPER_BLOCKS], [0])[0]
 
 
 def test_minimum_jerk_is_flash_and_hogan_s():

@@ -9,7 +9,7 @@ from experiments.benchmarks.haptic_loop import PassivityControl, squeeze, stiffe
 from hmmseg.contact.decompose import subtasks
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.replay import replay, residual_summary, smooth
-from simgap.world.simulate import simulate_trial
+from simgap.world.simulate import simulate_trials
 from simgap.world.virtual_model import (
     RIGID_PAD,
     VirtualModel,
@@ -24,7 +24,7 @@ STATES = [s.state for s in subtasks(STACK)]
 
 @pytest.fixture(scope="module")
 def performed():
-    return simulate_trial(STACK, HAND, PAPER_BLOCKS, seed=7)
+    return simulate_trials(STACK, HAND, [PAPER_BLOCKS], [7])[0]
 
 
 def places(done):

@@ -1,8 +1,8 @@
-"""One module a kind of file; `read_table` chooses among them.
+"""Readers of files, one module per kind, chosen by `read_table`.
 
-Each has `read(path, part, wanted)`: a `Table` with the columns in `wanted` (all for None) that
-the file has. Kinds that hold several recordings also have `parts(path)`; one of them is named
-after a `#`: `demos.hdf5#demo_3`.
+Each has `read(path, part, wanted)`, which returns a `Table` with the columns in `wanted` (all for None) that
+the file has. Kinds that hold several recordings also have `parts(path)`; `#` selects one:
+`demos.hdf5#demo_3`. Kinds that can be read in pieces have `num_rows` and `read_pieces`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ KINDS = {
 EXTRAS = {"parquet": "parquet", "lerobot": "parquet", "hdf5": "hdf5", "mcap": "mcap", "bag": "bag"}
 NEEDED = {"parquet": ("pyarrow",), "lerobot": ("pyarrow",), "hdf5": ("h5py",),
           "mcap": ("mcap", "mcap_ros2"), "bag": ("rosbags",)}  # fmt: skip
-LOGS = ("mcap", "bag")  # made of messages: `[topics]` maps them
+LOGS = ("mcap", "bag")  # logs of messages, which `[topics]` maps
 A_TRIAL = "a trial (.csv, .tsv, .parquet, .npz, .mcap, .bag, .hdf5 or a data set's folder)"
 
 
 def split_part(path: str | Path) -> tuple[Path, str | None]:
-    """The file and, after a `#`, which of its recordings; a file of that very name goes first."""
+    """The file and, after a `#`, one of its recordings, unless a file of that very name exists."""
     path = Path(path)
     if path.exists() or "#" not in path.name:
         return path, None
@@ -41,7 +41,7 @@ def split_part(path: str | Path) -> tuple[Path, str | None]:
 
 
 def kind_of(path: Path) -> str:
-    """The module that reads this file or folder; InputError where there is none."""
+    """The module that reads this file or folder; InputError if there is none."""
     if path.is_dir():
         if (path / "meta/info.json").is_file():
             return "lerobot"
@@ -61,7 +61,7 @@ def kind_of(path: Path) -> str:
 
 
 def read_table(path: str | Path, wanted: Sequence[str] | None = None) -> Table:
-    """The table of a file; InputError for whatever a parser makes of one it cannot parse."""
+    """The table of a file; InputError if it cannot be parsed."""
     file, part = split_part(path)
     kind = kind_of(file)
     with _parsing(path, "a table with a header row"):
@@ -75,7 +75,7 @@ def read_table(path: str | Path, wanted: Sequence[str] | None = None) -> Table:
 
 @contextmanager
 def _parsing(path: str | Path, expected: str = "") -> Iterator[None]:
-    """Within it whatever a parser raises becomes an InputError: those of hostile files raise anything."""
+    """Turn whatever a parser raises into an InputError: on damaged files they raise anything."""
     try:
         yield
     except InputError:
@@ -88,21 +88,21 @@ def _parsing(path: str | Path, expected: str = "") -> Iterator[None]:
 
 
 def rows_of(path: Path, kind: str) -> int | None:
-    """Rows of a file that can be read in pieces; None of any other."""
+    """Rows of a file that can be read in pieces; None for any other."""
     module = _module(kind, path)
     return module.num_rows(path) if hasattr(module, "read_pieces") else None
 
 
 def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) -> Iterator[Table]:
     """Tables of about `rows` rows each, in order, none of fewer than `least`; InputError as `read_table`."""
-    from hmmseg.io.table import appended
+    from hmmseg.io.table import append
 
     file, _ = split_part(path)
     waiting: Table | None = None
     with _parsing(path):
         for piece in _module(kind_of(file), path).read_pieces(file, wanted, rows):
             if waiting is not None and len(piece.rows) < least:
-                waiting = appended(waiting, piece)
+                waiting = append(waiting, piece)
                 continue
             if waiting is not None:
                 yield waiting
@@ -112,7 +112,7 @@ def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) ->
 
 
 def parts_of(path: str | Path) -> list[str]:
-    """Names of the recordings that a file holds; none where the file is one recording itself."""
+    """Names of the recordings in a file; none if the file is a single recording."""
     file, part = split_part(path)
     module = _module(kind_of(file), path)
     if part is not None or not hasattr(module, "parts"):

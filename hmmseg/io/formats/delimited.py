@@ -1,9 +1,9 @@
-"""Tables in text as labs write them.
+"""Tables in text files.
 
-Separators are commas, semicolons, tabs or runs of spaces, or what a first line `sep=;` says; decimals have
-points, or commas where cells are not separated by them; lines that begin with #, % or // are comments, and a
-comment may be the header; a row of units may follow the header. A last line that is cut off is left out, and
-so are zero bytes at the end: what a recorder leaves that was broken off.
+Separators are commas, semicolons, tabs or runs of spaces, or named by a first line `sep=;`; decimals have
+points, or commas where these do not separate cells; lines that begin with #, % or // are comments, and a
+comment may be the header; a row of units may follow the header. A truncated last line is dropped, and so are
+zero bytes at the end, which recorders leave when they are interrupted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hmmseg.io.units import known_unit
 COMMENTS = ("#", "%", "//")
 MAX_LINE = 10_000_000  # limit: bytes of the first line
 SPACES = r"\s+"
-SAID_SEPARATOR = re.compile(r"sep=(.)", re.IGNORECASE)  # first line of a spreadsheet's CSV
+STATED_SEPARATOR = re.compile(r"sep=(.)", re.IGNORECASE)  # first line of a spreadsheet's CSV
 TEXT = frozenset(range(256)) - set(range(9)) - set(range(14, 32)) - {127}  # bytes that a text may have
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|nan|NaN|inf|")
 COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
@@ -33,7 +33,7 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 class Layout:
     """The layout of one text file; line numbers count from 0.
 
-    `most`: cells of the longest row, of which those beyond the names are empty. `notes`: what was left out.
+    `most`: cells of the longest row, of which those beyond the names are empty. `notes`: what was dropped.
     """
 
     encoding: str
@@ -48,7 +48,7 @@ class Layout:
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
-    """Table of a text file; its rows are numbered by line, from 1."""
+    """Table of a text file; rows are numbered by line, from 1."""
     import pandas as pd
 
     layout = find_layout(path)
@@ -67,15 +67,15 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     for name, values in columns.items() if layout.decimal == "," else ():
         for i, cell in enumerate(values if values.dtype.kind == "O" else ()):
             if isinstance(cell, str) and "." in cell and NUMBER.fullmatch(cell.replace(",", "").strip()):
-                raise InputError(f"{path}: row {rows[i]}, column {name}",  # nobody can say what it means
+                raise InputError(f"{path}: row {rows[i]}, column {name}",  # ambiguous
                                  f"{cell} has a decimal point, others have commas", "one kind")  # fmt: skip
             if isinstance(cell, str) and COMMA_NUMBER.fullmatch(cell.strip()):
-                values[i] = cell.replace(",", ".")  # so that a cell that is no number is named, and not this
+                values[i] = cell.replace(",", ".")  # so that errors name cells that are no numbers
     return Table(str(path), tuple(names), columns, rows, layout.units, notes=layout.notes)
 
 
 def find_layout(path: Path) -> Layout:
-    """Layout of a text file, every row checked for its number of cells."""
+    """Layout of a text file, with the number of cells in every row checked."""
     with path.open("rb") as file:
         start = file.readline(MAX_LINE)
     if len(start) == MAX_LINE:
@@ -87,7 +87,7 @@ def find_layout(path: Path) -> Layout:
         start = error.object[: error.start + 1]
         if encoding != "utf-8-sig" or not set(start) < TEXT:
             raise
-        return _layout(path, "cp1252")  # umlauts as spreadsheets of western Europe write them
+        return _layout(path, "cp1252")  # umlauts as written by spreadsheets in western Europe
 
 
 def _layout(path: Path, encoding: str) -> Layout:
@@ -98,15 +98,16 @@ def _layout(path: Path, encoding: str) -> Layout:
     rows: list[int] = []
     notes: list[str] = []
     decimal, most, line = ".", 0, ""
-    decimals: set[int] = set()  # how many stand at the ends of rows
+    decimals: set[int] = set()  # decimal places at the ends of rows
     with path.open(encoding=encoding, newline="") as file:
         for number, line in enumerate(file):
             text = line.rstrip("\r\n").replace("\0", " ")
-            said = SAID_SEPARATOR.fullmatch(text.strip()) if header is None else None
-            if said or not text.strip() or text.lstrip().startswith(COMMENTS):
-                separator = said.group(1) if said else separator
+            stated = STATED_SEPARATOR.fullmatch(text.strip()) if header is None else None
+            blank = not text.strip()
+            if stated or blank or text.lstrip().startswith(COMMENTS):
+                separator = stated.group(1) if stated else separator
                 skipped.append(number)
-                comments += [text] if header is None and text.strip() and not said else []
+                comments += [text] if header is None and not blank and not stated else []
                 continue
             if header is None:
                 separator = separator or separator_of(text)
@@ -114,7 +115,7 @@ def _layout(path: Path, encoding: str) -> Layout:
                 if header is None:
                     header = cells_of(text, separator)
                     skipped.append(number)
-                while header and not header[-1].strip():  # separators at the ends of lines
+                while header and not header[-1].strip():  # trailing separators
                     header.pop()
                 most = len(header)
                 if most > MAX_COLUMNS:
@@ -159,9 +160,10 @@ def _layout(path: Path, encoding: str) -> Layout:
 
 
 def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] | None:
-    """The header, where a comment holds it (as `numpy.savetxt` writes it) and `line` is the first row.
+    """The header, if a comment holds it (as `numpy.savetxt` writes it) and `line` is the first row of
+    numbers.
 
-    Signs of a comment before it and before its first name are no part of the name.
+    Comment signs before its first name are not part of the name.
     """
     cells = cells_of(line, separator)
     if not _numeric(cells):
@@ -174,7 +176,7 @@ def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] |
 
 
 def separator_of(line: str) -> str:
-    """What separates the cells of a header."""
+    """The character that separates the cells of a header."""
     for separator in ("\t", ";", ","):
         if separator in line:
             return separator
@@ -182,7 +184,7 @@ def separator_of(line: str) -> str:
 
 
 def cells_of(line: str, separator: str) -> list[str]:
-    """Cells of a line, quotes taken off."""
+    """Cells of a line, without quotes."""
     if separator == SPACES:
         return line.split()
     if '"' in line:
@@ -195,7 +197,7 @@ def _numeric(cells: list[str]) -> bool:
 
 
 def units_of(header: list[str], cells: list[str]) -> dict[str, str]:
-    """Units of a row that holds nothing else: `s;mm;N`, `[s],[mm],[N]`; empty where it is no such row."""
+    """Units of a row with nothing else, such as `s;mm;N` or `[s],[mm],[N]`; empty for any other row."""
     if len(cells) != len(header):
         return {}
     found = {}

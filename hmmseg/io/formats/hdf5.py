@@ -1,7 +1,7 @@
-"""HDF5 in robomimic's layout, `data/demo_0/obs/...`, or with columns at the top; read with h5py.
+"""HDF5 in robomimic's layout, `data/demo_0/obs/...`, or with columns at the top level; read with h5py.
 
-A column's name is its path below the demonstration, `obs/robot0_eef_pos[0]`. Robomimic stores no
-times: `t` is made from `control_freq` in the file's `env_args` where present.
+A column's name is its path below the demonstration, `obs/robot0_eef_pos[0]`. Robomimic stores no times: `t`
+is computed from `control_freq` in the file's `env_args` if present.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import h5py
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, check_part, flat, is_wanted, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, check_part, flat, is_wanted, make_table
 
-MAX_WIDTH = 64  # numerics: numbers a row: images are no channels
+MAX_WIDTH = 64  # numerics: numbers per row; images are no channels
 
 
 def parts(path: Path) -> list[str]:
-    """Names of the demonstrations; none where the file is one recording."""
+    """Names of the demonstrations; none if the file is one recording."""
     with h5py.File(path, "r") as file:
         data = file.get("data")
         if not isinstance(data, h5py.Group):
@@ -48,11 +48,11 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         lengths = [len(values) for values in columns.values()]
         lengths = lengths or [each.shape[0] for each in datasets.values()]
         columns = {"t": np.arange(max(lengths, key=lengths.count, default=0)) / rate, **columns}
-    return plain_table(f"{path}#{part}" if part else str(path), columns, rest)
+    return make_table(f"{path}#{part}" if part else str(path), columns, rest)
 
 
 def _datasets(group: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str, h5py.Dataset]]:
-    """Numbers by name, one row a sample; links to other files are not followed."""
+    """Numeric data sets by name, one row per sample; links to other files are not followed."""
     for name in group:
         if isinstance(group.get(name, getlink=True), h5py.ExternalLink) or depth > 4:
             continue
@@ -60,18 +60,13 @@ def _datasets(group: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str,
         if isinstance(entry, h5py.Group):
             yield from _datasets(entry, f"{prefix}{name}/", depth + 1)
         elif isinstance(entry, h5py.Dataset) and entry.dtype.kind in "fiu" and entry.ndim:
-            width = int(np.prod(entry.shape[1:]))
-            if (
-                entry.shape[0] <= MAX_ROWS
-                and width <= MAX_WIDTH
-                and not entry.is_virtual
-                and not entry.external
-            ):
+            small = entry.shape[0] <= MAX_ROWS and int(np.prod(entry.shape[1:])) <= MAX_WIDTH
+            if small and not entry.is_virtual and not entry.external:
                 yield f"{prefix}{name}", entry
 
 
 def _control_rate(file: h5py.File) -> float | None:
-    """Samples a second, from robomimic's `env_args`."""
+    """Sampling rate [Hz], from robomimic's `env_args`."""
     data = file.get("data")
     text = data.attrs.get("env_args") if isinstance(data, h5py.Group) else None
     try:

@@ -1,9 +1,9 @@
-"""LeRobot data sets, v2 (a file an episode) and v3 (many in a file): Parquet and meta/info.json.
+"""LeRobot data sets, v2 (a file per episode) and v3 (many in a file): Parquet and meta/info.json.
 
-A folder's episodes are its recordings, `dataset#3`. A feature's entries carry the names that
-info.json gives them, `observation.state.left_x`, or their number, `observation.state[0]`. Rows of language
-(version 3.1: LeRobot's `lerobot.datasets.language`) become one column of text a style, `language.subtask`:
-what holds at each sample.
+A folder's episodes are its recordings, `dataset#3`. Entries of a feature have the names in info.json,
+`observation.state.left_x`, or their index, `observation.state[0]`. Language rows (version 3.1: LeRobot's
+`lerobot.datasets.language`) become one text column per style, such as `language.subtask`: the text that holds
+at each sample.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from hmmseg.errors import InputError
 from hmmseg.io.formats.parquet import to_columns
 from hmmseg.io.schema import read_json
-from hmmseg.io.table import Table, check_part, plain_table
+from hmmseg.io.table import Table, check_part, make_table
 
 EPISODE = "episode_index"
 PERSISTENT, EVENTS = "language_persistent", "language_events"
@@ -60,25 +60,25 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
     for file in data_files(path):
         table = pq.read_table(file, filters=[(EPISODE, "==", int(part))])
         if table.num_rows:
-            said = spoken(table)
+            texts = texts_by_style(table)
             table = table.drop_columns([name for name in (PERSISTENT, EVENTS) if name in table.column_names])
-            columns = _named(to_columns(table), info) | said
+            columns = _rename_entries(to_columns(table), info) | texts
             break
     else:
         raise InputError(f"{path}#{part}", "has no samples", "an episode")
     rest = [name for name in columns if wanted is not None and name not in wanted]
-    return plain_table(f"{path}#{part}", columns, rest, wanted)
+    return make_table(f"{path}#{part}", columns, rest, wanted)
 
 
 def language_rows(table: pa.Table) -> list[dict[str, Any]]:
-    """Rows of language that hold from a time on, of one episode: every sample repeats all of them."""
+    """Persistent language rows of one episode, which every sample repeats."""
     if PERSISTENT not in table.column_names:
         return []
     return next((rows for rows in table.column(PERSISTENT).to_pylist() if rows), [])
 
 
 def read_subtasks(folder: Path) -> bool:
-    """Whether any episode of a data set has rows of language of style `subtask`."""
+    """Whether any episode of a data set has language rows of style `subtask`."""
     for file in data_files(folder):
         if PERSISTENT not in pq.read_schema(file).names:
             continue
@@ -88,7 +88,7 @@ def read_subtasks(folder: Path) -> bool:
     return False
 
 
-def spoken(table: pa.Table) -> dict[str, np.ndarray]:
+def texts_by_style(table: pa.Table) -> dict[str, np.ndarray]:
     """By style, the text (num_timesteps,) that holds at each sample of an episode; None before the first."""
     out: dict[str, np.ndarray] = {}
     rows = language_rows(table)
@@ -102,7 +102,8 @@ def spoken(table: pa.Table) -> dict[str, np.ndarray]:
 
 
 def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, str]]]) -> pa.Table:
-    """A table of samples whose rows of language have these subtasks [(start in s, name), ...] by episode."""
+    """A table of samples with these subtasks [(start in s, name), ...] by episode added to its language
+    rows."""
     fields = [("role", pa.string(), False), ("content", pa.string(), True), ("style", pa.string(), True)]
     more = [("camera", pa.string(), True), ("tool_calls", pa.list_(pa.string()), True)]
     episodes = table.column(EPISODE).to_numpy()
@@ -135,8 +136,8 @@ def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, 
     return table
 
 
-def _named(columns: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Entries of features under the names that info.json has for them."""
+def _rename_entries(columns: dict[str, np.ndarray], info: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Columns renamed to the names of the features' entries in info.json."""
     out: dict[str, np.ndarray] = {}
     labels = {}
     for name, feature in info["features"].items():

@@ -1,18 +1,17 @@
-"""Logs made of messages: MCAP, ROS 1 bags (.bag) and ROS 2 bags (a folder, or its .db3).
+"""Logs of messages: MCAP, ROS 1 bags (.bag) and ROS 2 bags (a folder, or its .db3).
 
-A column of a log is a topic and a field as Foxglove writes them, `/left/wrench.wrench.force.x`
-or `/hand.data[2]`; fields of a message that names its entries (a JointState) carry those names,
-`/joint_states.position.left_1`. A topic has all columns that any of its messages names, each at the rate
-of the messages that name it. A message's time is the stamp in its header where every wanted topic has one
-and these are of one clock, and else when it was logged: two clocks are never mixed.
+A column of a log is a topic and a field as Foxglove writes them, `/left/wrench.wrench.force.x` or
+`/hand.data[2]`; fields of a message that names its entries (a JointState) carry those names,
+`/joint_states.position.left_1`. A topic has all columns that any of its messages names, each at the rate of
+those messages. A message's time is the stamp in its header if every wanted topic has stamps of one clock,
+else the time of logging: two clocks are never mixed.
 
 All wanted columns are joined on the times of the fastest. Slower ones are interpolated linearly between
-their two neighbouring messages and marked; where these lie further apart than three of the column's usual
-periods, and before its first and after its last message, they are missing (NaN).
+neighbouring messages and marked; where these are more than three of the column's usual periods apart, and
+before its first and after its last message, they are missing (NaN).
 
-Files are read from their beginning without index, summary or metadata.yaml: what a recorder left unfinished
-is read as far as it goes, and that is said. So is what cannot be decoded: a topic of an unknown type is
-left out.
+Files are read from the beginning, without index, summary or metadata.yaml: an unfinished recording is read as
+far as it goes, with a note. Topics of unknown types are left out, likewise.
 """
 
 from __future__ import annotations
@@ -37,11 +36,11 @@ from hmmseg.errors import InputError
 from hmmseg.io.table import Table, shown
 from hmmseg.levels import GAP
 
-MAX_ENTRIES = 64  # numerics: of an array in a message: images and clouds are no channels
+MAX_ENTRIES = 64  # numerics: of an array in a message; images and clouds are no channels
 MAX_MESSAGES = 20_000_000  # limit: more is a damaged or hostile file
-MAX_CHUNK = 2**30  # limit: bytes that a chunk of a bag may unpack to
+MAX_CHUNK = 2**30  # limit: bytes of an unpacked chunk
 LATE = 1e9  # limit: ns between a message's stamp and its logging; more is another clock
-ZSTD = b"\x28\xb5\x2f\xfd"  # how data packed by Zstandard begin
+ZSTD = b"\x28\xb5\x2f\xfd"  # first bytes of Zstandard data
 
 Message = tuple[str, int, Callable[[], Any]]  # topic, when it was logged [ns since 1970], how to decode it
 
@@ -50,7 +49,7 @@ Message = tuple[str, int, Callable[[], Any]]  # topic, when it was logged [ns si
 class Stream:
     """Messages of one topic while they are read: times [ns since 1970] and flat fields.
 
-    `stamped` is 0 where a message has no stamp; `failed` counts those that could not be decoded, for the
+    `stamped` is 0 for a message without a stamp; `failed` counts those that could not be decoded, with the
     `reason` of the first.
     """
 
@@ -62,11 +61,11 @@ class Stream:
     reason: str = ""
 
     def add(self, logged: int, decode: Callable[[], Any]) -> None:
-        """Keep one message, or why it cannot be decoded."""
+        """Keep one message, or the reason why it cannot be decoded."""
         try:
             message = decode()
-            values = dict(_flat(message, self.topic))
-        except Exception as error:  # decoders of hostile messages raise anything
+            values = dict(_flatten(message, self.topic))
+        except Exception as error:  # decoders raise anything on hostile messages
             self.failed += 1
             self.reason = self.reason or shown(error) or type(error).__name__
             return
@@ -82,8 +81,8 @@ class Stream:
         return list(dict.fromkeys(name for each in self.values for name in each))
 
     def columns(self, by_header: bool) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Columns that the same messages name: times (num_messages,) [ns], in order and no two alike, and
-        values (num_messages,) by name."""
+        """Columns named by the same messages: distinct increasing times (num_messages,) [ns], and values
+        (num_messages,) by name."""
         times = np.array(self.stamped if by_header else self.logged, dtype=np.int64)
         where: dict[str, list[int]] = {}
         for i, each in enumerate(self.values):
@@ -95,12 +94,12 @@ class Stream:
         for indices, names in together.items():
             at = np.array(indices)
             at = at[np.argsort(times[at], kind="stable")]
-            at = at[np.append(np.diff(times[at]) > 0, True)]  # of messages at one time the last counts
+            at = at[np.append(np.diff(times[at]) > 0, True)]  # the last of simultaneous messages counts
             yield times[at], {n: np.array([self.values[i][n] for i in at], dtype=np.float64) for n in names}
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
-    """The wanted columns on one clock; of topics that are not wanted only the first message is decoded."""
+    """The wanted columns on one clock; of other topics only the first message is decoded."""
     streams: dict[str, Stream] = {}
     notes: list[str] = []
     count = 0
@@ -112,7 +111,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
                 stream.add(logged, decode)
     except InputError:
         raise
-    except Exception as error:  # parsers of files that were broken off raise anything
+    except Exception as error:  # parsers raise anything on truncated files
         if not any(stream.values for stream in streams.values()):
             raise
         notes.append(f"{path}: breaks off after {count} messages ({shown(error) or type(error).__name__}); "
@@ -125,17 +124,17 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
                              "messages of ROS with a known type, or JSON")  # fmt: skip
         which = f"{stream.failed} messages of topic" if stream.values else "topic"
         notes.append(f"{path}: {which} {stream.topic} cannot be decoded ({stream.reason}) and is left out")
-    return joined(str(path), list(streams.values()), wanted, notes)
+    return join_streams(str(path), list(streams.values()), wanted, notes)
 
 
 def _messages(path: Path, notes: list[str]) -> Iterator[Message]:
-    """Every message of a file or folder, as they lie there; what is missing is added to `notes`."""
+    """All messages of a file or folder, in order; missing parts are reported in `notes`."""
     if path.is_dir():
         if not (path / "metadata.yaml").is_file():
             notes.append(f"{path}: has no metadata.yaml: the recording was not finished; all files are read")
         files = sorted(file for end in ("mcap", "db3") for file in path.glob(f"*.{end}"))
         if not files:
-            yield from _packed_bag(path)
+            yield from _compressed_messages(path)
         for file in files:
             yield from _messages(file, notes)
     elif path.suffix.lower() == ".mcap":
@@ -183,8 +182,8 @@ def _mcap_messages(file: BufferedReader, path: Path, notes: list[str]) -> Iterat
 
 
 def _db3_messages(path: Path) -> Iterator[Message]:
-    """Messages of a ROS 2 bag's database, in the order in which they were written."""
-    waiting = Path(f"{path}-wal")  # written, and not yet put where they belong
+    """Messages of a ROS 2 bag's database, in the order of writing."""
+    waiting = Path(f"{path}-wal")  # SQLite's write-ahead log, not yet merged
     how = "mode=ro" if waiting.is_file() and waiting.stat().st_size else "immutable=1"
     with sqlite3.connect(f"file:{quote(str(path.absolute()))}?{how}", uri=True) as base:
         try:
@@ -201,8 +200,8 @@ def _db3_messages(path: Path) -> Iterator[Message]:
             yield topic, logged, partial(decode, data)
 
 
-def _packed_bag(folder: Path) -> Iterator[Message]:
-    """Messages of a ROS 2 bag whose files are packed."""
+def _compressed_messages(folder: Path) -> Iterator[Message]:
+    """Messages of a ROS 2 bag whose files are compressed."""
     from rosbags.rosbag2 import Reader
 
     with Reader(folder) as reader:
@@ -223,12 +222,12 @@ def _bag_messages(file: BufferedIOBase, path: Path, notes: list[str]) -> Iterato
             notes.append(
                 f"{path}: has no index: the recording was not finished; it is read as far as it goes"
             )
-        inside = [(head, data)] if kind != b"\x05" else _records(_unpacked(head, data))
+        inside = [(head, data)] if kind != b"\x05" else _records(_decompress(head, data))
         for inner, content in inside:
             if inner[b"op"] == b"\x07":
-                said = _fields(content)
-                kind_name = said[b"type"].decode().replace("/", "/msg/")
-                decoder = _Decoder(kind_name, "ros1", said[b"message_definition"].decode())
+                declared = _parse_fields(content)
+                kind_name = declared[b"type"].decode().replace("/", "/msg/")
+                decoder = _Decoder(kind_name, "ros1", declared[b"message_definition"].decode())
                 topics[inner[b"conn"]] = inner[b"topic"].decode(), decoder
             elif inner[b"op"] == b"\x02":
                 seconds, rest = struct.unpack("<II", inner[b"time"])
@@ -238,18 +237,18 @@ def _bag_messages(file: BufferedIOBase, path: Path, notes: list[str]) -> Iterato
 
 def _records(file: BufferedIOBase) -> Iterator[tuple[dict[bytes, bytes], bytes]]:
     while size := file.read(4):
-        head = _fields(_exactly(file, int.from_bytes(size, "little")))
-        yield head, _exactly(file, int.from_bytes(_exactly(file, 4), "little"))
+        head = _parse_fields(_read_exactly(file, int.from_bytes(size, "little")))
+        yield head, _read_exactly(file, int.from_bytes(_read_exactly(file, 4), "little"))
 
 
-def _exactly(file: BufferedIOBase, size: int) -> bytes:
-    data = file.read(size)  # of a size that the file does not have no more than there is
+def _read_exactly(file: BufferedIOBase, size: int) -> bytes:
+    data = file.read(size)  # allocates no more than the file has
     if len(data) < size:
         raise EOFError("the file ends within a record")
     return data
 
 
-def _fields(data: bytes) -> dict[bytes, bytes]:
+def _parse_fields(data: bytes) -> dict[bytes, bytes]:
     out, at = {}, 0
     while at < len(data):
         end = at + 4 + int.from_bytes(data[at : at + 4], "little")
@@ -258,7 +257,7 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
     return out
 
 
-def _unpacked(head: dict[bytes, bytes], data: bytes) -> BufferedIOBase:
+def _decompress(head: dict[bytes, bytes], data: bytes) -> BufferedIOBase:
     how, size = head[b"compression"], int.from_bytes(head[b"size"], "little")
     if size > MAX_CHUNK:
         raise ValueError(f"a chunk claims {size} bytes")
@@ -274,7 +273,7 @@ def _unpacked(head: dict[bytes, bytes], data: bytes) -> BufferedIOBase:
 
 
 class _Decoder:
-    """Messages of one type of ROS from bytes; the definition is parsed when the first is decoded."""
+    """Decodes messages of one ROS type; the definition is parsed at the first message."""
 
     def __init__(self, kind: str, encoding: str, definition: str) -> None:
         self.kind, self.encoding, self.definition = kind, encoding, definition
@@ -300,19 +299,19 @@ class _Decoder:
 
 
 def topic_wanted(topic: str, wanted: Sequence[str] | None) -> bool:
-    """Whether any wanted column may be of this topic."""
+    """Whether any wanted column may belong to this topic."""
     return wanted is None or any(each.startswith((f"{topic}.", f"{topic}[")) for each in wanted)
 
 
-def joined(
+def join_streams(
     file: str, streams: Sequence[Stream], wanted: Sequence[str] | None, notes: Sequence[str] = ()
 ) -> Table:
-    """One table of all wanted columns on the times of the fastest of them."""
+    """One table of all wanted columns, on the times of the fastest of them."""
     names = ("t", *(name for stream in streams for name in stream.names))
     used = [s for s in streams if s.values and (wanted is None or set(s.names) & set(wanted))]
     if not used:
         return Table(file, names, {"t": np.zeros(0)}, np.arange(0), messages=True, notes=tuple(notes))
-    by_header, said = _clock_of(file, used)
+    by_header, clock_notes = _clock_of(file, used)
     read = []
     for stream in used:
         for times, found in stream.columns(by_header):
@@ -330,14 +329,14 @@ def joined(
             else:
                 columns[name], marks[name] = interpolated(ticks, times, values)
     return Table(file, names, columns, np.arange(1, ticks.size + 1), origin=int(ticks[0]), interpolated=marks,
-                 messages=True, rates=rates, notes=(*notes, *said))  # fmt: skip
+                 messages=True, rates=rates, notes=(*notes, *clock_notes))  # fmt: skip
 
 
 def _clock_of(file: str, used: Sequence[Stream]) -> tuple[bool, list[str]]:
-    """Whether the headers' stamps are of one clock, and what is said where they are of several.
+    """Whether the headers' stamps are of one clock, and a note if they are of several.
 
-    Messages of one recorder are logged by one clock, soon after they are stamped. By how much stamps lie
-    behind is then much the same, even where they count from elsewhere (simulated time).
+    Messages of one recorder are logged by one clock, soon after they are stamped. Their stamps lag by much
+    the same, even if they count from another zero (simulated time).
     """
     if not all(all(stream.stamped) for stream in used):
         return False, []
@@ -355,9 +354,9 @@ def _clock_of(file: str, used: Sequence[Stream]) -> tuple[bool, list[str]]:
 
 
 def interpolated(ticks: np.ndarray, times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values at the ticks (num_ticks,), NaN in gaps, and which lie between two messages.
+    """Values at the ticks (num_ticks,), NaN in gaps, and which of them lie between two messages.
 
-    `ticks` and `times` are in ns (or s), increasing; `values` (num_messages,), of which NaN are left out.
+    `ticks` and `times` are in ns (or s), increasing; NaN among `values` (num_messages,) are skipped.
     """
     there = np.isfinite(values)
     times, values = times[there], values[there]
@@ -366,7 +365,7 @@ def interpolated(ticks: np.ndarray, times: np.ndarray, values: np.ndarray) -> tu
     exact = np.isin(ticks, times)
     span = np.pad(np.diff(times), 1)[np.searchsorted(times, ticks)]  # 0 before the first and after the last
     near = ~exact & (span > 0) & (span <= GAP * _period(times))
-    # Times in ns are too large for floating-point numbers, their differences are not.
+    # Times in ns exceed the precision of floating-point numbers, their differences do not.
     out = np.interp(ticks - times[0], times - times[0], values)
     return np.where(exact | near, out, np.nan), near
 
@@ -376,7 +375,7 @@ def _period(times: np.ndarray) -> float:
 
 
 def _stamp(message: Any) -> int:
-    """The header's stamp [ns], 0 where there is none."""
+    """The header's stamp [ns], 0 if there is none."""
     stamp = _get(_get(message, "header"), "stamp")
     seconds = _get(stamp, "sec", _get(stamp, "secs", 0))
     fraction = _get(stamp, "nanosec", _get(stamp, "nsec", _get(stamp, "nsecs", 0)))
@@ -388,7 +387,7 @@ def _get(thing: Any, name: str, default: Any = None) -> Any:
 
 
 def _members(message: Any) -> Iterator[tuple[str, Any]] | None:
-    """Named members of a message of any library, None for what is no message."""
+    """Named members of a message of any library, None for anything else."""
     if isinstance(message, dict):
         return iter(message.items())
     if dataclasses.is_dataclass(message):
@@ -398,7 +397,7 @@ def _members(message: Any) -> Iterator[tuple[str, Any]] | None:
     return None
 
 
-def _flat(message: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, float]]:
+def _flatten(message: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, float]]:
     if isinstance(message, bool | str | bytes) or message is None or depth > 12:
         return
     if isinstance(message, int | float | np.number):
@@ -407,20 +406,19 @@ def _flat(message: Any, prefix: str, depth: int = 0) -> Iterator[tuple[str, floa
     if isinstance(message, list | tuple | np.ndarray):
         if 0 < len(message) <= MAX_ENTRIES:
             for i, entry in enumerate(message):
-                yield from _flat(entry, f"{prefix}[{i}]", depth + 1)
+                yield from _flatten(entry, f"{prefix}[{i}]", depth + 1)
         return
     members = _members(message)
     if members is None:
         return
     labels = _get(message, "name")
-    labels = (
-        list(labels) if isinstance(labels, list | tuple) and all(isinstance(n, str) for n in labels) else []
-    )
+    if not isinstance(labels, list | tuple) or not all(isinstance(n, str) for n in labels):
+        labels = []
     for name, value in members:
         if name == "header" or name.startswith("__"):
             continue
         if labels and isinstance(value, list | tuple | np.ndarray) and len(value) == len(labels):
             for label, entry in zip(labels, value, strict=True):
-                yield from _flat(entry, f"{prefix}.{name}.{label}", depth + 1)
+                yield from _flatten(entry, f"{prefix}.{name}.{label}", depth + 1)
         else:
-            yield from _flat(value, f"{prefix}.{name}", depth + 1)
+            yield from _flatten(value, f"{prefix}.{name}", depth + 1)

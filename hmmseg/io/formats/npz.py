@@ -1,4 +1,4 @@
-"""NumPy archives: one array a column, nothing pickled, nothing unpacked that claims more than there is."""
+"""NumPy archives: one array per column, without pickled objects or arrays larger than they claim."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, is_wanted, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, is_wanted, make_table
 
 MAX_MEMBER = 16 * MAX_ROWS  # bytes of one array
 MAX_ARCHIVE = 8 * MAX_MEMBER  # bytes of all that are read
 BOMB = 2**28  # limit: bytes; an archive that unpacks to more than this
-PACKED = 200  # limit: and to so many times its size holds nothing that was measured: readings have noise
+PACKED = 200  # limit: and to so many times its size holds no measurements: readings have noise
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
@@ -34,11 +34,11 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         file.seek(0)
         arrays = np.load(file, allow_pickle=False)
         columns = {name: arrays[name] for name in chosen}
-    return plain_table(str(path), columns, [name for name in names if name not in chosen], wanted)
+    return make_table(str(path), columns, [name for name in names if name not in chosen], wanted)
 
 
 def num_rows(path: Path) -> int | None:
-    """Rows of an archive's first array; None where it is none, or not to be read in pieces."""
+    """Rows of an archive's first array; None if there is none, or it cannot be read in pieces."""
     if not zipfile.is_zipfile(path):
         return None
     with zipfile.ZipFile(path) as archive:
@@ -51,7 +51,7 @@ def num_rows(path: Path) -> int | None:
 
 
 def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator[Table]:
-    """Tables of at most `rows` rows each, in order: a long file in bounded memory, packed or not."""
+    """Tables of at most `rows` rows each, in order: a long file in bounded memory, compressed or not."""
     with zipfile.ZipFile(path) as archive, ExitStack() as open_:
         every, members, kinds, lengths = _names(archive), {}, {}, {}
         for name in every:
@@ -104,7 +104,7 @@ def _check_size(path: Path, archive: zipfile.ZipFile, names: Sequence[str]) -> N
 
 
 def _claimed(path: Path, archive: zipfile.ZipFile, name: str) -> int:
-    """Bytes that a member's array has by its own header; InputError where the file has fewer, or too many."""
+    """Bytes of a member's array by its own header; InputError if the file has fewer, or too many."""
     info = archive.getinfo(f"{name}.npy")
     with archive.open(info) as member:
         shape, _, dtype = _header(member)

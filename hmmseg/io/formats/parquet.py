@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hmmseg.errors import InputError
-from hmmseg.io.table import MAX_ROWS, Table, check_unique, flat, is_wanted, plain_table
+from hmmseg.io.table import MAX_ROWS, Table, check_unique, flat, is_wanted, make_table
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
@@ -22,7 +22,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         check_unique(names, str(path))
         columns = to_columns(file.read(columns=[name for name in names if is_wanted(name, wanted)]))
     rest = [name for name in names if not any(c == name or c.startswith(f"{name}[") for c in columns)]
-    return plain_table(str(path), columns, rest, wanted)
+    return make_table(str(path), columns, rest, wanted)
 
 
 def num_rows(path: Path) -> int:
@@ -33,9 +33,10 @@ def num_rows(path: Path) -> int:
 
 def read_pieces(path: Path, wanted: Sequence[str] | None, rows: int) -> Iterator[Table]:
     """Tables of at most `rows` rows each, in order: a long file in bounded memory."""
-    with pq.ParquetFile(path, pre_buffer=False) as file:  # which would hold all of the file
+    with pq.ParquetFile(path, pre_buffer=False) as file:  # buffering would hold the whole file
         names, first = file.schema_arrow.names, 1
-        chosen = [name for name in names if is_wanted(name, wanted)]  # by one thread: each has a memory
+        chosen = [name for name in names if is_wanted(name, wanted)]
+        # One thread, as each has its own memory pool.
         for batch in file.iter_batches(batch_size=rows, columns=chosen, use_threads=False):
             columns = to_columns(pa.Table.from_batches([batch]))
             numbers = np.arange(first, first + batch.num_rows)
@@ -51,7 +52,7 @@ def to_columns(table: pa.Table) -> dict[str, np.ndarray]:
 def _array(column: pa.ChunkedArray) -> np.ndarray:
     kind = column.type
     if len(column) and column.num_chunks == 1 and not column.null_count and pa.types.is_float64(kind):
-        numbers = column.chunk(0)  # as they lie there: to_numpy imports pandas, some 50 MB
+        numbers = column.chunk(0)  # without a copy: to_numpy imports pandas, some 50 MB
         return np.frombuffer(numbers.buffers()[1], np.float64, len(numbers), 8 * numbers.offset)
     if pa.types.is_fixed_size_list(kind) or pa.types.is_list(kind) or pa.types.is_large_list(kind):
         if column.null_count:

@@ -1,4 +1,4 @@
-"""`hmmseg diagnose --simulator` and `--mjcf`: logs of any robot against its owner's own model."""
+"""`hmmseg calibrate`, and `hmmseg diagnose --simulator` or `--mjcf`: a robot's logs against a model of it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
+from hmmseg.numbers import estimate, interval, shown_as
 from hmmseg.tables import listed
-from hmmseg_cli.console import Output, check_file, check_folder, strict_json
+from hmmseg_cli import options as opt
+from hmmseg_cli.console import Output, check_file, check_folder, distinct_trials, strict_json
 from simgap.report.finding import sentence
 from simgap.report.finding import tables as usual_tables
 
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OwnSimulator:
-    """What the command line says of the owner's model."""
+    """The owner's model, as given on the command line."""
 
     simulator: str | None
     mjcf: Path | None
@@ -45,7 +47,7 @@ class OwnSimulator:
 
     @property
     def given(self) -> bool:
-        """Whether a model was brought; InputError for what goes only with one."""
+        """Whether a model was given; InputError for options that go only with one."""
         of_mjcf = {"--map": self.map_file, "--candidate": next(iter(self.candidates), None)}
         if self.mjcf is None:
             for option, value in of_mjcf.items():
@@ -64,7 +66,7 @@ class OwnSimulator:
         return False
 
     def check_alone(self, others: Mapping[str, Any]) -> None:
-        """InputError for an option that has no meaning with the owner's model, and for places to write."""
+        """InputError for options without meaning for an owner's model, and for unwritable destinations."""
         for option, value in others.items():
             if value:
                 raise InputError(option, "does not go with a simulator of your own")
@@ -84,7 +86,7 @@ class OwnSimulator:
 def read_logs(
     out: Output, paths: Sequence[Path], own: OwnSimulator
 ) -> tuple[Simulator, list[Recording], Loaded | None]:
-    """The simulator, the logs of its channels, and what was loaded of an MJCF."""
+    """The simulator, logs of its channels, and the loaded MJCF if that is the model."""
     if own.simulator is not None:
         from simgap.simulators.recording import read_recording
         from simgap.simulators.user import load_simulator
@@ -105,7 +107,7 @@ def read_logs(
 def fitted_effects(
     simulator: Simulator, logs: Sequence[Recording], loaded: Loaded | None
 ) -> dict[str, RobotEffect]:
-    """What is fitted to logs before anything else is asked: of an MJCF all that is rarely measured."""
+    """Effects fitted before anything else is asked: of an MJCF, all parameters that are rarely measured."""
     from simgap.robot_effects import UNMEASURED, effects_of
 
     if loaded is None:
@@ -115,9 +117,9 @@ def fitted_effects(
 
 @contextmanager
 def show_stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages, with the position within a long one; yields the callback of each stage.
+    """Progress by stages, with the position within long ones; yields the callback of each stage.
 
-    InputError where the model runs so far from its logs that no equation can be solved.
+    InputError if the simulation diverges so far from the logs that no equation can be solved.
     """
     from numpy.linalg import LinAlgError
 
@@ -139,17 +141,68 @@ def show_stages(out: Output, text: str, total: int) -> Iterator[Progress]:
 
 
 def warn_of_engine(out: Output, own: OwnSimulator) -> None:
-    """What MuJoCo warned of, each once."""
+    """Warnings of MuJoCo, each once."""
     if own.mjcf is not None:
         from simgap.simulators.mjcf.engine import warned
 
         out.warn(*warned())
 
 
+def calibrate(
+    logs: opt.Trials, model: opt.RobotModel = None, map_file: opt.Map = None, simulator: opt.Simulator = None,
+    patch: opt.Patch = None, json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False,
+) -> None:  # fmt: skip
+    """A robot's friction, rotor inertias, gains, delay: fitted to its logs, and what these leave open."""
+    with Output("calibrate", json=json, seed=seed, quiet=quiet) as out:
+        own = OwnSimulator(simulator, model, map_file, (), patch)
+        if not own.given:
+            raise InputError("--model", "missing", "--model XML --map MAP.toml, or --simulator FILE.py:NAME")
+        own.check_alone({})
+        from simgap.robots.calibrate import STAGES
+        from simgap.robots.calibrate import calibrate as fit
+        from simgap.robots.patch import write_patch
+
+        robot, recordings, loaded = read_logs(out, distinct_trials(logs), own)
+        length = getattr(robot, "window", None) if loaded is None else loaded.map.length
+        effects = fitted_effects(robot, recordings, loaded)
+        with show_stages(out, "calibrating", STAGES) as tell:
+            found = fit(robot, recordings, effects, length=length, tell=tell)
+        warn_of_engine(out, own)
+        document = found.body()
+        reasons = (f"{name}: {reason}" for name, reason in document["reasons"].items())
+        out.print(*_calibration_tables(document), *reasons)
+        if patch is not None:
+            changed = [n for n in found.point if not found.composed.effects[n].numeric]
+            given = found.composed, found.point, document, changed, model
+            write_patch(*given, lambda name: out.stage(patch / name))
+        out.finish(document)
+
+
+def _calibration_tables(document: dict[str, Any]) -> list[Table]:
+    """Tables of parameters and of residuals on held-out logs."""
+    sums = [
+        {"name": " + ".join(n if c == 1 else f"{c:.3g} {n}" for n, c in one["of"].items()), **one}
+        for one in document["combinations"]
+    ]
+    named = [{"name": n, **p} for n, p in (document["parameters"] | document["numerics"]).items()]
+    rows = []
+    for p in (*named, *sums):
+        shown, value = shown_as(p["unit"]), ("undetermined", "")
+        nominal = "" if "nominal" not in p else f"{shown[0] * p['nominal']:.4g} {shown[1]}"
+        if p["mean"] is not None:
+            value = estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown=shown)
+        rows.append((p["name"], nominal, *value))
+    heads = ("parameter", "the model has", "calibrated", "90 % interval")
+    after = document["heldout"]["after"]
+    rms = [(n, f"{v:.4g}", f"{after[n]:.4g}") for n, v in document["heldout"]["before"].items()]
+    columns = ("channel", "as the model came", "calibrated")
+    return [listed("parameters", heads, rows), listed("free runs along held-out logs, rms", columns, rms)]
+
+
 def diagnose_robot(
     out: Output, paths: Sequence[Path], own: OwnSimulator, task: Path | None, effect: Sequence[str]
 ) -> None:
-    """Read, diagnose, and put table, figures, page, patch and document where `out` has them go."""
+    """Read, diagnose, and write table, figures, page, patch and document to the destinations of `out`."""
     from simgap.robots.describe import body
     from simgap.robots.diagnose import STAGES, diagnose
 
@@ -159,7 +212,7 @@ def diagnose_robot(
     phases = None
     if task is not None:
         from hmmseg.io.task import read_task
-        from simgap.robots.phases import phases_by_task
+        from simgap.robots.rows import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
     with show_stages(out, "diagnosing", STAGES) as tell:
@@ -168,22 +221,22 @@ def diagnose_robot(
                          phases=phases, tell=tell, warn=out.warn)  # fmt: skip
     document = body(found)
     warn_of_engine(out, own)
-    said, left = sentence(document), document["remainder"]["rms_over_noise"]
-    size = [] if "times the noise" in said else [f"What is left is {left:.3g} times the noise."]
-    out.print(said, *size, *tables(document, found))
+    headline, left = sentence(document), document["remainder"]["rms_over_noise"]
+    size = [] if "times the noise" in headline else [f"What is left is {left:.3g} times the noise."]
+    out.print(headline, *size, *tables(document, found))
     _deliver(out, own, found, document, loaded, recordings, found.composed.effects)
     if own.patch is not None:
-        given = found.composed, found.linear.point, document, document["causes"]
-        if document["verdict"] == "unknown" and found.calibrated is not None:  # the best model there is
+        corrected = found.composed, found.linear.point, document, document["causes"]
+        if document["verdict"] == "unknown" and found.calibrated is not None:  # then the best model there is
             whole, point = found.calibrated.composed, found.calibrated.point
             moved = [n for n in point if not whole.effects[n].numeric]
-            given = whole, point, document["calibrated"], moved
-        _patch(out, own, *given)
+            corrected = whole, point, document["calibrated"], moved
+        _patch(out, own, *corrected)
     out.finish(document)
 
 
 def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], own: OwnSimulator) -> None:
-    """What changed of a robot since its `healthy` logs: table, figure, page, patch and document."""
+    """Changes of a robot since its `healthy` logs: table, figure, page, patch and document."""
     from simgap.robots.changes import STAGES, changes
 
     simulator, logs, loaded = read_logs(out, [*paths, *healthy], own)
@@ -203,7 +256,7 @@ def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], o
 
 
 def _patch(out: Output, own: OwnSimulator, composed: Any, point: Any, document: Any, causes: Any) -> None:
-    """Write the corrected model, and say where, and what an MJCF has no place for."""
+    """Write the corrected model, and say where, and what has no place in an MJCF."""
     from simgap.robots.patch import write_patch
 
     folder = own.patch
@@ -219,7 +272,7 @@ def _deliver(
     out: Output, own: OwnSimulator, found: RobotDiagnosis | Changes, document: dict[str, Any],
     loaded: Loaded | None, logs: Sequence[Recording], effects: Mapping[str, RobotEffect],
 ) -> None:  # fmt: skip
-    """History, the motion to run next, courses for Rerun, figures and the page."""
+    """Write history, the motion to run next, courses for Rerun, figures and the page."""
     from simgap.report import robot
 
     units = robot.own_units(loaded)
@@ -236,7 +289,7 @@ def _deliver(
     motion, place = robot.next_motion(document, logs), None
     if motion is not None and folder is not None:
         name = "next_motion.csv"
-        while any(log.name == name for log in logs):  # recorded when it was asked for last
+        while any(log.name == name for log in logs):  # the motion that was asked for last time
             name = f"next_{name}"
         place = folder / name
         time = ("t", 1.0) if loaded is None else (loaded.map.time, loaded.map.time_factor)
@@ -265,19 +318,19 @@ def _deliver(
         out.stage(out.report).write_text(page(document, setting, draw), encoding="utf-8")
 
 
-def _history(said: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
-    """What moved since each parameter was known last, as a table."""
-    if not said:
+def _history(compared: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
+    """Table of the changes of each parameter since it was last known."""
+    if not compared:
         return [f"the history begins with this run: {len(now)} parameters"]
     rows = []
-    for name, p in said.items():
+    for name, p in compared.items():
         ends = ("" if v is None else f"{v:.4g} {p['unit']}" for v in (p["then"], p["now"]))
         rows.append((name, *ends, p["since"], p["says"]))
     return [listed("since it was known last", ("parameter", "then", "now", "since", ""), rows, wraps=True)]
 
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
-    """What the logs leave open first, then the tables of every diagnosis, and held-out residuals."""
+    """What the logs leave open, the tables of every diagnosis, and held-out residuals."""
     rows, unseen = [], document["identifiability"]["unseen"]
     for one in document["identifiability"]["alike"][:6]:
         how = "act only together" if one["exact"] else f"are alike but for {100 * one['own']:.1f} %"

@@ -1,4 +1,4 @@
-"""`hmmseg effects`: the candidate effects of a sim-to-real gap."""
+"""`hmmseg decompose` and `hmmseg effects`: what a task reveals, and what may cause a sim-to-real gap."""
 
 from __future__ import annotations
 
@@ -11,6 +11,35 @@ from hmmseg_cli.console import Output
 
 if TYPE_CHECKING:
     from simgap.effects.base import HandEffect
+
+
+def decompose(
+    task: opt.TaskArgument, json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False
+) -> None:
+    """Subtasks, contact states, and the properties and signals each can reveal."""
+    from hmmseg.contact.decompose import decompose as decompose_task
+    from hmmseg.contact.tables import decomposition_table, equation, reasons
+    from hmmseg.io.task import read_task
+
+    with Output("decompose", json=json, seed=seed, quiet=quiet) as out:
+        found = decompose_task(read_task(task))
+        out.print(*in_words(found), decomposition_table(found), equation(found))
+        for note in (*found.notes, *(f"{key}: {reason}" for key, reason in reasons(found).items())):
+            out.print(note)
+        out.finish({"task": str(task), **found.to_json()})
+
+
+def in_words(found: Any) -> list[str]:
+    """For each object, which subtasks reveal which property."""
+    lines = []
+    for name, known in found.properties.items():
+        parts = []
+        for prop, entry in known.items():
+            seen = dict.fromkeys(found.subtasks[k].label for one in entry.evidence[:1] for k in one.subtasks)
+            if seen:
+                parts.append(f"{prop.replace('_', ' ')} in {' and '.join(seen)}")
+        lines.append(f"{name}: {'; '.join(parts) or 'nothing is revealed'}.")
+    return lines
 
 
 def effects(json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False) -> None:
