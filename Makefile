@@ -99,11 +99,15 @@ gap-labs: $(INSTALLED)  ## diagnoses of open labs in the folder LABS; fills docs
 	$(BIN)/python -m experiments.write_tables
 
 FRESH := experiments/results/gap_fresh.json
+HEALTHY_SEEDS := 271201 271301
+ACTING_SEEDS := 271171 271211 271311
 gap-fresh: $(INSTALLED)  ## diagnoses of labs of our own second simulator, drawn anew; fills docs/gap_results.md
-	$(BIN)/python -m experiments.blind_check open --cases 36 --seed 271161 --out build/healthy
-	$(BIN)/python -m experiments.blind_check open --cases 36 --seed 271171 --tiers single pair outside --out build/acting
-	$(BIN)/python -m experiments.gap_drawn build/healthy --results build/healthy_found --run "seed 271161" --output $(FRESH)
-	$(BIN)/python -m experiments.gap_drawn build/acting --results build/acting_found --run "seed 271171" --output $(FRESH)
+	for seed in $(HEALTHY_SEEDS); do \
+	  $(BIN)/python -m experiments.blind_check open --cases 24 --seed $$seed --out build/$$seed || exit; done
+	for seed in $(ACTING_SEEDS); do \
+	  $(BIN)/python -m experiments.blind_check open --cases 36 --seed $$seed --tiers single pair outside --out build/$$seed || exit; done
+	for seed in $(HEALTHY_SEEDS) $(ACTING_SEEDS); do \
+	  $(BIN)/python -m experiments.gap_drawn build/$$seed --results build/$${seed}_found --run "seed $$seed" --output $(FRESH) || exit; done
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md

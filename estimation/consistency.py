@@ -127,7 +127,7 @@ def _carries(
     """Trial, move and weights (num_timesteps,) of each grip's mean `name` where all `needed` are recorded."""
     for a in weighed:
         known = np.all([np.isfinite(getattr(a.signals, each)) for each in needed], axis=0)
-        for move, grip in a.weights.grips.items():
+        for move, grip in a.grips.items():
             weight = grip[name].mean(axis=0) * known
             if (weight > 0).sum() >= FEWEST:
                 yield a, move, weight / weight.sum()
@@ -137,7 +137,7 @@ def _squeeze(rig: Rig, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
     """Both fingers press a carried block equally, apart from its inertia."""
     pressed = []
     for a, _, weight in _carries(weighed, "force", "fx1", "fx2"):
-        free = free_forces(a.signals, a) if a.weights.free.any() else np.zeros(4)
+        free = free_forces(a.signals, a) if a.free.any() else np.zeros(4)
         left, right = (weight @ np.nan_to_num(fx) for fx in (a.signals.fx1, -a.signals.fx2))
         if left > free[0] and right > -free[2]:
             pressed.append((left - free[0], right + free[2]))
@@ -159,7 +159,7 @@ def _balance(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterato
     of, sums, apart, factors, weights, noises = [], [], [], [], [], []
     for a, move, weight in _carries(weighed, "force", "fy1", "fy2"):
         s, inside = a.signals, weight > 0
-        factor, free = gravity_factor(s, rig), a.weights.free > 0
+        factor, free = gravity_factor(s, rig), a.free > 0
         if free.sum() < MIN_FREE:
             continue
         noises.append([np.nanmean(np.diff(np.where(free, f, np.nan), 2) ** 2) / 6 for f in (s.fy1, s.fy2)])
@@ -244,7 +244,7 @@ def _motion(aligned: AlignedTrials) -> Iterator[Tie]:
 
 def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iterator[Grip]:
     """Where the fingertips hold each standing block."""
-    for move, grip in a.weights.grips.items():
+    for move, grip in a.grips.items():
         ground = [s for s in aligned.subtasks if s.move == move and s.state == ON_GROUND and present[s.index]]
         for key, of in (("pickup", ground[:1]), ("place", ground[1:])):
             weight = grip[key].mean(axis=0)
@@ -433,7 +433,7 @@ def _noise_excess(weighed: Sequence[WeighedTrial], rig: Rig) -> tuple[float, flo
     for axis in "xy":
         bends, followed = [], []
         for a, finger in product(weighed, (1, 2)):
-            force = np.where(a.weights.free > 0, getattr(a.signals, f"f{axis}{finger}"), np.nan)
+            force = np.where(a.free > 0, getattr(a.signals, f"f{axis}{finger}"), np.nan)
             bend = np.diff(force, 2) / a.signals.sd_force
             bends.append(bend)
             followed.append(bend[1:] * bend[:-1])

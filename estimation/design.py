@@ -227,36 +227,22 @@ class PadDoubt:
         return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 
-def _softer_pads(fingers: tuple[int, ...], axis: str):
+def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads whose compliance is 1 + size of the nominal: their faces lie elsewhere under a force."""
+        """Pads whose compliance is 1 + size of the nominal, so that their faces lie elsewhere under a force.
+
+        With `usual`: pads that give as force^(1 + size), as the nominal at that force; to first order.
+        """
         signals, moved = task_space(trial, rig), {}
         for finger in fingers:
-            name = f"{axis}{finger}"
-            give = getattr(signals, f"f{name}") * _compliance(rig, finger, axis)
-            moved[name] = getattr(signals, name) - give * size
+            name = f"{'x' if kind == 'normal' else 'y'}{finger}"
+            law = getattr(signals, f"f{name}")
+            if usual is not None:
+                law = law * np.log(np.maximum(np.abs(law), 1e-3 * usual) / usual)
+            moved[name] = getattr(signals, name) - law * getattr(unit_pads(rig), f"{kind}{finger}") * size
         return replace(signals, **moved)
 
     return read
-
-
-def _bent_pads(axis: str, usual: float):
-    def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads that give as force^(1 + size), as the nominal at the force `usual`; to first order."""
-        signals, moved = task_space(trial, rig), {}
-        for finger in (1, 2):
-            name = f"{axis}{finger}"
-            force = getattr(signals, f"f{name}")
-            bend = force * np.log(np.maximum(np.abs(force), 1e-3 * usual) / usual)
-            moved[name] = getattr(signals, name) - _compliance(rig, finger, axis) * bend * size
-        return replace(signals, **moved)
-
-    return read
-
-
-def _compliance(rig: Rig, finger: int, axis: str) -> float:
-    """Of one pad [m/N]: along the grip (x) or in shear (y)."""
-    return getattr(unit_pads(rig), ("normal" if axis == "x" else "shear") + str(finger))
 
 
 def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
@@ -291,25 +277,25 @@ def nuisances(
     stated = min(max(doubts["normal"].extra_sd, *s.pad_stiffness) / np.log(2), MOST_BENT)
     # The pads of one hand are of one make, so most of the stated uncertainty of their stiffness is common.
     common = min(s.pad_stiffness) * np.sqrt(1 - UNLIKE**2)
-    for axis, (kind, doubt) in zip("xy", doubts.items(), strict=True):
+    for kind, doubt in doubts.items():
         bend = MOST_BENT * doubt.give or (stated if kind == "normal" else 0.0)
         admitted = 0.0 if doubt.give else common
         both = max(doubt.extra_sd, UNSTATED if doubt.give else 0.0)
         both = float(np.hypot(np.hypot(both, bend) if both else 0.0, admitted))
-        admit(f"pad_{kind}", both, 1e-3, _softer_pads((1, 2), axis))
+        admit(f"pad_{kind}", both, 1e-3, _other_pads(kind, (1, 2)))
         for finger in (1, 2):
             own = 0.0 if doubt.give else s.pad_stiffness[finger - 1]
             sd = np.sqrt(own**2 - admitted**2 + (UNLIKE * max(doubt.extra_sd, doubt.give)) ** 2)
-            admit(f"pad_{kind}.{finger}", sd, 1e-3, _softer_pads((finger,), axis))
+            admit(f"pad_{kind}.{finger}", sd, 1e-3, _other_pads(kind, (finger,)))
         if any(n.name.startswith(f"pad_{kind}") for n in out):
-            admit(f"pad_{kind}_exponent", bend, 1e-3, _bent_pads(axis, max(doubt.usual, 1e-3)))
+            admit(f"pad_{kind}_exponent", bend, 1e-3, _other_pads(kind, (1, 2), max(doubt.usual, 1e-3)))
     admit("touch", touch_sd, 1e-5, _wider)
     return tuple(out)
 
 
 ZERO_SHARE = 0.05  # limit: share of the largest force; a zero that drifts less matters less than other errors
 
-# Slopes that show the pads, by their names in `Weights.slopes`: their channel, and the readings they weigh.
+# Slopes that show the pads, by name in `WeighedTrial.slopes`: their channel, and the readings they weigh.
 SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
 
 
@@ -317,9 +303,9 @@ def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[i
     """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
     values, out = {k: np.nan_to_num(v) for k, v in channel_values(signals, rig).items()}, []
     for move in moves:
-        counts = weighed.weights.counts[move]
+        counts = weighed.counts[move]
         means = {k: np.where(counts[k] > 0, w @ values[k], np.nan)
-                 for k, w in weighed.weights.grips[move].items()}  # fmt: skip
+                 for k, w in weighed.grips[move].items()}  # fmt: skip
         out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
     return np.moveaxis(np.array(out), 2, 0)
 
@@ -329,7 +315,7 @@ def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Seq
     values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
         for k, (name, (_, reading)) in enumerate(SLOPES.items()):
-            slope = weighed.weights.slopes.get(move, {}).get(name)
+            slope = weighed.slopes.get(move, {}).get(name)
             if slope is not None:
                 out[i, k] = slope.weights @ np.nan_to_num(values[reading])
     return out
@@ -337,7 +323,7 @@ def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Seq
 
 def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Variances (num_moves, len(SLOPES)) of slopes, infinite where absent, and their common errors."""
-    slopes = [[weighed.weights.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
+    slopes = [[weighed.slopes.get(m, {}).get(name) for name in SLOPES] for m in moves]
     variance = [[np.inf if s is None else s.variance for s in row] for row in slopes]
     return np.array(variance), np.array([[0.0 if s is None else s.alike for s in row] for row in slopes])
 
@@ -350,7 +336,7 @@ def pad_doubts(
     `variance`, `alike`: as in `slope_variances`, of all trials.
     """
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
-    for s, grip in ((a.signals, grip) for a in weighed for grip in a.weights.grips.values()):
+    for s, grip in ((a.signals, grip) for a in weighed for grip in a.grips.values()):
         along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
         usual.append((np.mean(grip["distance"] @ along), abs(np.mean(grip["place"] @ up))))
     admitted, out = float(np.hypot(*rig.systematic.pad_stiffness)) / 2, {}
@@ -374,7 +360,7 @@ def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int])
     out = []
     with np.errstate(divide="ignore", invalid="ignore"):  # channels without readings
         for move in moves:
-            part = {k: noise.variance[k] / n for k, n in weighed.weights.counts[move].items()}
+            part = {k: noise.variance[k] / n for k, n in weighed.counts[move].items()}
             out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
     return np.moveaxis(np.array(out), 2, 0)
 
@@ -391,7 +377,7 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     for a in weighed:
         squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
         gives.append([(np.mean(w["distance"] @ squeeze), *(np.mean(w[k] @ shear) for k in
-                      ("pickup", "force", "place"))) for w in a.weights.grips.values()])  # fmt: skip
+                      ("pickup", "force", "place"))) for w in a.grips.values()])  # fmt: skip
     grip, picked, carried, placed = np.moveaxis(np.array(gives), -1, 0)
     hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
     least = np.maximum(hanging, np.abs(placed - carried))
@@ -408,7 +394,7 @@ def free_means(
     the rig's own bias allow, is known in a grip no better than these stretches agree.
     """
     mean = np.stack([free_forces(a.signals, a) for a in weighed])
-    count = np.array([max(a.weights.free_count, 1.0) for a in weighed])
+    count = np.array([max(a.free_count, 1.0) for a in weighed])
     of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
     variance = of_sample[None, :] / count[:, None]
     moved = np.stack([_moved_zero(a, free_steps, of_sample, rig) for a in weighed])
@@ -418,7 +404,7 @@ def free_means(
 def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray, rig: Rig) -> np.ndarray:
     """Largest deviation (4,) [N] of a free stretch's forces from the mean of all; 0 if due to noise."""
     out = np.zeros(len(FORCE_CHANNELS))
-    spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.weights.free > 0) for k in free_steps]
+    spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0) for k in free_steps]
     for i, name in enumerate(FORCE_CHANNELS):
         force = getattr(a.signals, name)
         pieces = [force[span & np.isfinite(force)] for span in spans]
@@ -514,7 +500,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     raw = np.stack([observe(a.signals, a, rig, moves) for a in weighed])  # T, S, M, 3
     variance = np.stack([sampling_variance(a, noise, moves) for a in weighed])
     factor = np.stack(
-        [[a.weights.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in weighed]
+        [[a.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in weighed]
     )
     valid = np.isfinite(raw) & np.isfinite(variance)
     there = valid.mean(axis=1) > 0.5  # of the alignments

@@ -70,7 +70,7 @@ def ground_friction(
 
 def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:
     """Rows (num_samples, 3) of d fx [N], d a / g and fy [N] while the block surely slides."""
-    s, free = a.signals, a.weights.free
+    s, free = a.signals, a.free
     sliding = a.masks[:, step.index].all(axis=0) & np.isfinite(s.fx + s.fy + s.vx)
     if not sliding.any():
         return np.zeros((0, 3))
@@ -335,7 +335,7 @@ def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
 
     Variation in free motion beyond the sensors' noise (a cable that pulls) counts as noise.
     """
-    free, stated = a.weights.free > 0, a.signals.sd_force
+    free, stated = a.free > 0, a.signals.sd_force
     stated = stated if np.isfinite(stated) else sd_force
     centred, sds = [], []
     for name in (f"fx{finger}", f"fy{finger}"):

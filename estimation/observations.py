@@ -66,7 +66,7 @@ def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str,
     return out
 
 
-def learned(pooled: dict[str, list], scales: dict[str, float], stated: dict[str, float]) -> Noise:
+def estimated_noise(pooled: dict[str, list], scales: dict[str, float], stated: dict[str, float]) -> Noise:
     """Noise of each channel from residuals and their weights, pooled over grips.
 
     `stated`: standard deviations of one sample, where known.
@@ -137,25 +137,6 @@ APART = 0.1  # chosen: s; longest time between the two fingers' touches or relea
 MIN_FREE = 8  # numerics: least samples of free motion to estimate the scale of forces
 
 
-@dataclass(frozen=True, repr=False)
-class Weights(Brief):
-    """Sample weights (num_alignments, num_timesteps) of each grip's means in one trial.
-
-    `grips[m]` maps "force", "distance", "pickup" and "place" to weights that sum to 1 over the samples (all
-    0: nothing recorded), `counts[m]` to effective sample numbers (num_alignments,); `free`: weights
-    (num_timesteps,) over free motion, `free_robust` (4, num_timesteps): those of each force, robust to a
-    finger that touches early. `slopes[m]` maps "distance" and "rise" to slopes over the pads' give within the
-    grip, and "landing" to that of heights from the touch to the place, where seen.
-    """
-
-    grips: dict[int, dict[str, np.ndarray]]
-    counts: dict[int, dict[str, np.ndarray]]
-    free: np.ndarray
-    free_robust: np.ndarray
-    free_count: float
-    slopes: dict[int, dict[str, Slope]] = field(default_factory=dict)
-
-
 def draw_boundaries(trial: TrialAlignment, rng: np.random.Generator, num: int) -> np.ndarray:
     """Boundary times (num, num_subtasks - 1) [s] drawn from their posteriors, kept in order."""
     columns = []
@@ -222,11 +203,25 @@ def robust_weights(
 
 @dataclass(frozen=True, repr=False)
 class WeighedTrial(Brief):
-    """One trial thinned for estimation: signals, subtask masks of drawn alignments, and weights of means."""
+    """One trial thinned for estimation: its `signals`, and sample weights of each grip's means.
+
+    `masks` (num_alignments, num_subtasks, num_timesteps): samples of the subtasks in drawn alignments.
+    `grips[m]` maps "force", "distance", "pickup" and "place" to weights (num_alignments, num_timesteps) that
+    sum to 1 over the samples (all 0: nothing recorded), `counts[m]` to effective sample numbers
+    (num_alignments,); `free`: weights (num_timesteps,) over free motion, of `free_count` samples;
+    `free_robust` (4, num_timesteps): those of each force, robust to a finger that touches early. `slopes[m]`
+    maps "distance" and "rise" to slopes over the pads' give within the grip, and "landing" to that of heights
+    from the touch to the place, where seen.
+    """
 
     signals: Signals
     masks: np.ndarray
-    weights: Weights
+    grips: dict[int, dict[str, np.ndarray]]
+    counts: dict[int, dict[str, np.ndarray]]
+    free: np.ndarray
+    free_robust: np.ndarray
+    free_count: float
+    slopes: dict[int, dict[str, Slope]] = field(default_factory=dict)
 
 
 def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[list[WeighedTrial], Noise]:
@@ -283,9 +278,9 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
             row[:] = np.where(free, weight, 0.0) / max(weight[free].sum(), 1e-9)
             scales[name] = max(scales.get(name, 0.0), scale)
             pooled[name].append((residual[free], weight[free]))
-        weights = Weights(grips, counts, free / max(free.sum(), 1), robust, float(free.sum()), slopes)
-        weighed.append(WeighedTrial(thinned, masks, weights))
-    return weighed, learned(pooled, scales, channel_sds([w.signals for w in weighed], aligned))
+        shares, count = free / max(free.sum(), 1), float(free.sum())
+        weighed.append(WeighedTrial(thinned, masks, grips, counts, shares, robust, count, slopes))
+    return weighed, estimated_noise(pooled, scales, channel_sds([w.signals for w in weighed], aligned))
 
 
 def _free_samples(s: Signals, free: np.ndarray) -> np.ndarray:
@@ -301,7 +296,7 @@ def _free_samples(s: Signals, free: np.ndarray) -> np.ndarray:
 def free_forces(signals: Signals, weighed: WeighedTrial) -> np.ndarray:
     """Mean forces (4,) in free motion [N], where they should vanish."""
     force = np.stack([getattr(signals, name) for name in FORCE_CHANNELS])
-    return (weighed.weights.free_robust * np.nan_to_num(force)).sum(axis=1)
+    return (weighed.free_robust * np.nan_to_num(force)).sum(axis=1)
 
 
 def _scale(trials: list[tuple[np.ndarray, np.ndarray]], groups: list[list[int]]) -> float:

@@ -24,7 +24,7 @@ def summary(draws: np.ndarray, unit: str) -> dict:
     """Unit, mean, sd, median and intervals of posterior draws (num_draws,)."""
     out = {"unit": unit, "mean": float(draws.mean()), "sd": float(draws.std(ddof=1))}
     out |= {"median": float(np.median(draws))}
-    return out | {name: np.percentile(draws, q) for name, q in INTERVALS.items()}
+    return out | {name: np.percentile(draws, q).tolist() for name, q in INTERVALS.items()}
 
 
 UNITS = decompose.UNITS | {"friction": "1"}

@@ -158,12 +158,8 @@ def run(cases: int, seed: int, keep: Path | None = None, commands: float = 0.02,
                     )
         finally:
             os.chdir(here)
-    return {
-        "cases": sum(outcomes.values()) + len(failures),
-        "seed": seed,
-        "outcomes": dict(outcomes),
-        "failures": failures,
-    }
+    count = sum(outcomes.values()) + len(failures)
+    return {"cases": count, "seed": seed, "outcomes": dict(outcomes), "failures": failures}
 
 
 def main() -> int:

@@ -146,16 +146,8 @@ def _page(port: str, address: str) -> Iterator[Page]:
 @contextlib.contextmanager
 def served(folder: Path, *arguments: str) -> Iterator[str]:
     """Run `hmmseg play` in another process; the page's address."""
-    command = [
-        sys.executable,
-        "-m",
-        "hmmseg_cli.main",
-        "play",
-        *arguments,
-        "--output",
-        str(folder),
-        "--no-open",
-    ]
+    own = ["--output", str(folder), "--no-open"]
+    command = [sys.executable, "-m", "hmmseg_cli.main", "play", *arguments, *own]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             assert process.stdout is not None
@@ -186,12 +178,8 @@ def stack(page: Page, moved: str, onto: str, pictures: bool = False) -> None:
     page.wait(0.9, pictures)
     page.mouse("mousePressed", x, y)
     page.wait(0.9, pictures)
-    for place, seconds in (
-        ((x, high), 1.0),
-        ((there, high), 1.0),
-        ((there, rest + 0.004), 0.9),
-        ((there, rest - 0.003), 0.8),
-    ):
+    way = ((x, high, 1.0), (there, high, 1.0), (there, rest + 0.004, 0.9), (there, rest - 0.003, 0.8))
+    for *place, seconds in way:
         page.mouse("mouseMoved", *place)
         page.wait(seconds, pictures)
     page.mouse("mouseReleased", there, rest - 0.003)

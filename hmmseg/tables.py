@@ -48,8 +48,8 @@ class Tabled(ABC):
         return "\n".join([*filter(None, [self.words()]), *map(as_text, self.tables())])
 
     def _repr_html_(self) -> str:
-        said = f"<p>{html.escape(self.words())}</p>" if self.words() else ""
-        return said + "".join(map(as_html, self.tables()))
+        intro = f"<p>{html.escape(self.words())}</p>" if self.words() else ""
+        return intro + "".join(map(as_html, self.tables()))
 
 
 def listed(

@@ -18,13 +18,12 @@ def decompose(
 ) -> None:
     """Subtasks, contact states, and the properties and signals each can reveal."""
     from hmmseg.contact.decompose import decompose as decompose_task
-    from hmmseg.contact.tables import decomposition_table, equation, reasons
     from hmmseg.io.task import read_task
 
     with Output("decompose", json=json, seed=seed, quiet=quiet) as out:
         found = decompose_task(read_task(task))
-        out.print(*in_words(found), decomposition_table(found), equation(found))
-        for note in (*found.notes, *(f"{key}: {reason}" for key, reason in reasons(found).items())):
+        out.print(*in_words(found), *found.tables(), found.equation())
+        for note in (*found.notes, *(f"{key}: {reason}" for key, reason in found.reasons.items())):
             out.print(note)
         out.finish({"task": str(task), **found.to_json()})
 

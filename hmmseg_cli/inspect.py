@@ -86,7 +86,7 @@ def _show(out: Output, found: Inspection) -> None:
          _number(c.minimum), _number(c.maximum), sparkline(c.course)) for c in found.channels
     ]  # fmt: skip
     out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
-    out.warn(*found.said)
+    out.warn(*found.remarks)
     segment = f"hmmseg segment {found.file} --task task.toml"
     if found.toml:
         out.print("proposed for rig.toml:")
@@ -121,7 +121,7 @@ def _document(found: Inspection) -> dict[str, Any]:
         "end": found.end, "rate": found.rate, "origin_ns": found.origin,
         "gaps": [{"start": start, "end": end} for start, end in found.gaps],
         "channels": [{name: getattr(c, name) for name in names} for c in found.channels],
-        "mapping": found.mapping, "toml": found.toml or None, "findings": found.said,
+        "mapping": found.mapping, "toml": found.toml or None, "findings": found.remarks,
     }  # fmt: skip
 
 

@@ -149,9 +149,9 @@ def write_mcap(path: Path, source: str | Path, trial: Trial, spans: Sequence[Spa
         for number, span in enumerate(spans):
             body = {name: getattr(span, name, None) or "" for name in ("subtask", "object", "state")}
             times = {name: getattr(span, name) for name in ("start", "end", "start_sd", "end_sd")}
-            said = json.dumps({"subtask_index": number} | body | times)
+            entry = json.dumps({"subtask_index": number} | body | times)
             when = origin + round(span.start * 1e9)
-            writer.add_message(channel, when, said.encode(), when, number)
+            writer.add_message(channel, when, entry.encode(), when, number)
         writer.finish()
 
 

@@ -145,8 +145,8 @@ def main(args: Sequence[str] | None = None) -> int:
     except UsageError as error:
         context = getattr(error, "ctx", None)
         path = context.command_path if context else "hmmseg"
-        said = error.format_message().partition("Traceback (most recent call last)")[0]  # type: ignore[attr-defined]
-        return _at_fault(f"{path}: {said.strip() or 'a value that cannot be read'} (see {path} --help)")
+        message = error.format_message().partition("Traceback (most recent call last)")[0]  # type: ignore[attr-defined]
+        return _at_fault(f"{path}: {message.strip() or 'a value that cannot be read'} (see {path} --help)")
     except typer.Abort:
         return 130
 

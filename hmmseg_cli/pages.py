@@ -224,12 +224,12 @@ def _numerics(body: Body) -> str:
         "option.late": "commands come {:.2f} of a sample late",
         "option.hold": "commands are held {:.0%} of the way from a step to a line",
     }
-    said = [
+    parts = [
         text.format(abs(v["after"]) if name == "option.hold" else v["after"])
         for name, text in known.items()
         if (v := (body.get("numerics") or {}).get(name)) and abs(v["after"]) > 0.05
     ]
-    return f"Fitted as well, and never a cause: {'; '.join(said)}." if said else ""
+    return f"Fitted as well, and never a cause: {'; '.join(parts)}." if parts else ""
 
 
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:

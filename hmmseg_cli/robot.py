@@ -318,12 +318,12 @@ def _deliver(
         out.stage(out.report).write_text(page(document, setting, draw), encoding="utf-8")
 
 
-def _history(said: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
+def _history(compared: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
     """Table of the changes of each parameter since it was last known."""
-    if not said:
+    if not compared:
         return [f"the history begins with this run: {len(now)} parameters"]
     rows = []
-    for name, p in said.items():
+    for name, p in compared.items():
         ends = ("" if v is None else f"{v:.4g} {p['unit']}" for v in (p["then"], p["now"]))
         rows.append((name, *ends, p["since"], p["says"]))
     return [listed("since it was known last", ("parameter", "then", "now", "since", ""), rows, wraps=True)]

@@ -9,14 +9,13 @@ from typing import Any
 from estimation.identification import Identification
 from estimation.report import parse_actual, read_actual
 from hmmseg.api import Source, align, block_task
-from hmmseg.contact.decompose import UNITS
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.align import AlignedTrials
 from simgap.gap.diagnose import Diagnosis
 from simgap.gap.diagnose import diagnose as diagnose_blocks
 from simgap.world.operator import OperatorSettings
-from simgap.world.properties import DEFAULT_FRICTION, Block, Blocks, paper_blocks, read_properties
+from simgap.world.properties import Block, Blocks, blocks_of, paper_blocks, read_properties
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 
@@ -108,16 +107,7 @@ def _blocks(properties: Any, task: BlockTask) -> Blocks:
     if properties is None:
         return paper_blocks(task)
     if isinstance(properties, Identification):
-        return {name: _identified(properties, name) for name in task.objects}
+        return blocks_of(properties.to_json()["properties"], task, "properties")
     if isinstance(properties, str | Path):
         return read_properties(properties, task)
     return properties
-
-
-def _identified(found: Identification, name: str) -> Block:
-    """A block with the posterior means of its properties, and the default friction unless slip was seen."""
-    weight, width, height = (float(found.of(name, key).mean()) for key in UNITS)
-    bound = found.friction.get(name)
-    draws = None if bound is None else bound.mu_draws
-    friction = DEFAULT_FRICTION if draws is None else float(draws.mean())
-    return Block(weight, width, height, friction)

@@ -1,6 +1,7 @@
 """What `import hmmseg, estimation, simgap` offers, used as a stranger would."""
 
 import dataclasses
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -215,3 +216,15 @@ def test_an_identification_calibrates_the_virtual_model(found):
     again = segment(made.trial, STACK / "task.toml", STACK / "rig.toml")[0]
     starts = np.array([span.start for span in again.spans[1:]])
     assert again.complete and np.abs(starts - made.boundaries).max() < 0.05
+
+
+def test_an_identification_is_simulated_as_its_json_is(found, tmp_path):
+    task = Task.read(STACK / "task.toml")
+    high = {
+        name: dataclasses.replace(f, lower_bound=1.5, mu_draws=None) for name, f in found.friction.items()
+    }
+    rough = dataclasses.replace(found, friction=high)
+    (tmp_path / "found.json").write_text(json.dumps(rough.to_json()))
+    blocks = simgap.simulate(task, STACK / "rig.toml", rough, seed=3)[0].blocks
+    assert blocks == simgap.simulate(task, STACK / "rig.toml", tmp_path / "found.json", seed=3)[0].blocks
+    assert {name: block.friction for name, block in blocks.items()} == dict.fromkeys(high, 1.5)

@@ -35,17 +35,9 @@ def load_rig(path: Path) -> Rig:
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     fingers = [table["fingers"]["1"], table["fingers"]["2"]]
     pad, noise = table["fingertip"], table["noise"]
-    return Rig(
-        np.array([f["base"] for f in fingers]),
-        np.array([f["links"] for f in fingers]),
-        pad["normal_stiffness"],
-        pad["shear_stiffness"],
-        noise["angle"],
-        noise["velocity"],
-        noise["force"],
-        table["rate"],
-        table["gravity"],
-    )
+    bases, links = (np.array([f[key] for f in fingers]) for key in ("base", "links"))
+    return Rig(bases, links, pad["normal_stiffness"], pad["shear_stiffness"], noise["angle"],
+               noise["velocity"], noise["force"], table["rate"], table["gravity"])  # fmt: skip
 
 
 def angles(rig: Rig, tips: np.ndarray, stretch: Stretch = 0.0) -> np.ndarray:

@@ -21,18 +21,9 @@ HEALTHY = ("healthy", "slight")
 HONEST = 0.3  # remainder beyond which a named cause does not hide an effect from outside
 # A diagnosis that ended in an error.
 NOTHING: dict[str, Any] = {
-    "verdict": "error",
-    "causes": [],
-    "indistinguishable": [],
-    "probabilities": {},
-    "attribution": {},
-    "where": [],
-    "effects": {},
-    "shrinkage": None,
-    "remainder": None,
-    "bic": "error",
-    "gains": {},
-}
+    "verdict": "error", "causes": [], "indistinguishable": [], "probabilities": {}, "attribution": {},
+    "where": [], "effects": {}, "shrinkage": None, "remainder": None, "bic": "error", "gains": {},
+}  # fmt: skip
 
 
 def label(entry: dict[str, Any]) -> str:
@@ -45,9 +36,11 @@ def label(entry: dict[str, Any]) -> str:
 
 
 def partners(entry: dict[str, Any]) -> set[str]:
-    """Effects of the catalogue whose set with the withheld one is a right answer."""
-    (name,) = entry["effects"]
-    given = PARTNERS.get(name, ())
+    """Effects of the catalogue whose set with the withheld one is a right answer; none for several
+    effects."""
+    given = (
+        [p for name in entry["effects"] for p in PARTNERS.get(name, ())] if len(entry["effects"]) == 1 else []
+    )
     return {p.rstrip("*") for p in given if not (p.endswith("*") and entry["measured"])}
 
 
@@ -123,7 +116,7 @@ def judge_case(entry: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
     if tier == "outside":
         row["right"] = found["verdict"] == "unknown" or (rest is not None and rest > HONEST)
     if tier == "withheld":
-        shared = bool(together & _stand_ins(entry, found)) and len(said) == 1
+        shared = bool(together & partners(entry)) and len(said) == 1
         row["right"] = found["verdict"] == "unknown" or shared or (rest is not None and rest > HONEST)
     if tier == "dense":
         row["dominant"] = bool(true) and max(entry["sizes"], key=lambda k: entry["sizes"][k]) in said
@@ -144,11 +137,6 @@ def _above(entry: dict, found: dict) -> bool:
     return visible(entry) if gain is None else gain >= FLOOR
 
 
-def _stand_ins(entry: dict, found: dict) -> set[str]:
-    """Effects accepted in place of a withheld one."""
-    return partners(entry) if len(entry["effects"]) == 1 else set()
-
-
 def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
     """The largest probability, and whether it belongs to the truth."""
     known = {k: v for k, v in found["probabilities"].items() if k != "other"}
@@ -157,7 +145,7 @@ def _top(entry: dict, found: dict) -> tuple[float, bool] | None:
     name = max(known, key=lambda k: known[k])
     right = name == label(entry)
     if entry["tier"] == "withheld":
-        right = right or name in _stand_ins(entry, found)
+        right = right or name in partners(entry)
     return float(known[name]), right
 
 

@@ -166,14 +166,8 @@ def plan(
     first = task.moves[0][0]
     x, top = centres[first][0], centres[first][1] + blocks[first].height / 2
     half = (blocks[first].width + u(*OPEN)) / 2
-    k = Knots(
-        PROFILES[style.profile](rng),
-        rng,
-        x=x + u(-0.015, 0.02),
-        y=top + u(0.012, 0.02),
-        left=half,
-        right=half,
-    )
+    profile = PROFILES[style.profile](rng)
+    k = Knots(profile, rng, x=x + u(-0.015, 0.02), y=top + u(0.012, 0.02), left=half, right=half)
     k.wait(u(*style.rest) / pace)
     for block, to in task.moves:
         start = yard.centres[block]

@@ -12,7 +12,6 @@ import numpy as np
 from experiments.paper.sources import recorded, save, simulated
 from experiments.recordings import Case
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, decompose, subtasks
-from hmmseg.contact.tables import cell, equation
 from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.thresholds import (
     FORCE_THRESHOLD,
@@ -34,10 +33,10 @@ def table_1() -> dict:
     rows = []
     for step in found.subtasks:
         row = {"subtask": f"{step.name} {step.object}", "state": step.state}
-        cells = {entry.name: cell(found, step.index, entry, evidence)
+        cells = {entry.name: found.cell(step.index, entry, evidence)
                  for entry, evidence in found.reveals(step.index)}  # fmt: skip
         rows.append(row | {column: cells.get(column, "") for column in COLUMNS})
-    return {"rows": rows, "equation": equation(found)}
+    return {"rows": rows, "equation": found.equation()}
 
 
 def probe() -> Signals:

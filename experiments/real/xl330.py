@@ -43,20 +43,10 @@ class Pendulum:
         "length": {"nominal": 0.1, "sd": 0.002, "unit": "m", "low": 0.02},
         "armature": {"nominal": 0.0, "sd": 0.002, "unit": "kg m^2", "low": 0.0},
         "load_friction": {"nominal": 0.0, "sd": 0.2, "unit": "1", "low": 0.0},
-        "load_stribeck.extra": {
-            "nominal": 0.0,
-            "sd": 0.2,
-            "unit": "1",
-            "low": 0.0,
-            "effect": "load_stribeck",
-        },
-        "load_stribeck.speed": {
-            "nominal": 0.3,
-            "sd": 0.2,
-            "unit": "rad/s",
-            "low": 0.02,
-            "effect": "load_stribeck",
-        },
+        "load_stribeck.extra": {"nominal": 0.0, "sd": 0.2, "unit": "1", "low": 0.0,
+                                "effect": "load_stribeck"},
+        "load_stribeck.speed": {"nominal": 0.3, "sd": 0.2, "unit": "rad/s", "low": 0.02,
+                                "effect": "load_stribeck"},
         "stribeck.extra": {"nominal": 0.0, "sd": 0.03, "unit": "N m", "low": 0.0, "effect": "stribeck"},
         "stribeck.speed": {"nominal": 0.3, "sd": 0.2, "unit": "rad/s", "low": 0.02, "effect": "stribeck"},
         "direction_friction": {"nominal": 0.0, "sd": 0.02, "unit": "N m"},
@@ -64,7 +54,7 @@ class Pendulum:
         "quadratic_drag": {"nominal": 0.0, "sd": 1e-3, "unit": "N m s^2/rad^2", "low": 0.0},
         "spring": {"nominal": 0.0, "sd": 0.02, "unit": "N m/rad", "low": 0.0},
         "joint_zero": {"nominal": 0.0, "sd": 0.01, "unit": "rad"},
-    }
+    }  # fmt: skip
     says = {  # noqa: RUF012
         "load_friction": "Coulomb friction grows by this share of what motor and weight press on the gears",
         "load_stribeck": "loaded gears rub more near standstill, by extra exp(-(w / speed)^2) of the load",

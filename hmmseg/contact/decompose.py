@@ -11,7 +11,8 @@ in all moves together, such as the heights in a tower of three.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, TypeVar
@@ -27,32 +28,41 @@ FINGERS = ("finger1", "finger2")
 
 
 @dataclass(frozen=True)
-class ContactState:
-    """The constraints of the hand and the manipulated object, between two changes of them.
+class Subtask:
+    """One step of a task, between two changes of the active constraints of the hand and its object.
 
-    `name`: of the contact state; the paper calls every support the ground. `support`: what the held object
-    touches besides the fingers, None while free or lifted. `beneath`: objects from its support down to the
-    ground. `move`: 0-based index of the move.
+    `state`: the contact state; the paper calls every support the ground. `move`: 0-based index in
+    `task.performed` of its move (None in a plain ordered task); a pregrasp belongs to the first move, a
+    release to the move it ends. `support`: what the held object touches besides the fingers, None while free
+    or lifted; `beneath`: objects from the support down to the ground.
     """
 
-    object: str
+    index: int
     name: str
-    support: str | None
-    beneath: tuple[str, ...]
-    move: int
+    object: str | None
+    state: str
+    move: int | None
+    support: str | None = None
+    beneath: tuple[str, ...] = ()
 
     @property
-    def held(self) -> bool:
-        """Whether the fingers hold the object."""
-        return self.name != FREE
+    def label(self) -> str:
+        """Its name in the interface, such as `carry block1`."""
+        return labelled(self.name, self.object)
 
     @property
     def constraints(self) -> tuple[str, ...]:
-        """The active contacts of the hand and the held object."""
-        fingers = [f"{finger}-{self.object}" for finger in FINGERS if self.held]
-        slips = " (slipping)" if self.name == SLIDING else ""
+        """The active contacts of the hand and the held object; none in a plain ordered task."""
+        if self.state == FREE or self.object is None:
+            return ()
+        slips = " (slipping)" if self.state == SLIDING else ""
         standing = [] if self.support is None else [f"{self.object}-{self.support}{slips}"]
-        return tuple(sorted(fingers + standing))
+        return tuple(sorted([*(f"{finger}-{self.object}" for finger in FINGERS), *standing]))
+
+
+def labelled(subtask: str, obj: str | None) -> str:
+    """A subtask with its object, such as `carry block1`; only its name if it has none."""
+    return subtask if obj is None else f"{subtask} {obj}"
 
 
 def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
@@ -64,24 +74,26 @@ def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
     return tuple(beneath)
 
 
-def contact_states(task: BlockTask) -> Iterator[ContactState]:
-    """The task's contact states in order, separated by changes of the constraint set.
+def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
+    """The ordered subtasks of a task.
 
-    The hand closes on the object, breaks its support contact or slides it, restores contact at the
-    destination, and opens.
+    In every move of blocks the hand closes on the object, breaks its support contact or slides it, restores
+    contact at the destination, and opens.
     """
+    if isinstance(task, SequenceTask):
+        return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
     support = dict(task.initial)
-    yield ContactState(task.performed[0].object, FREE, None, (), 0)
+    steps = [Subtask(0, "pregrasp", task.performed[0].object, FREE, 0)]
     for index, move in enumerate(task.performed):
-        obj, beneath = move.object, stack(support, move.object)
-        yield ContactState(obj, ON_GROUND, support[obj], beneath, index)
-        if move.slide:
-            yield ContactState(obj, SLIDING, support[obj], beneath, index)
-        else:
-            yield ContactState(obj, ABOVE_GROUND, None, (), index)
+        obj = move.object
+        lifted, before = (None, ()), (support[obj], stack(support, obj))
         support[obj] = move.to
-        yield ContactState(obj, ON_GROUND, move.to, stack(support, obj), index)
-        yield ContactState(obj, FREE, None, (), index)
+        after = (move.to, stack(support, obj))
+        moved = ("slide", SLIDING, before) if move.slide else ("carry", ABOVE_GROUND, lifted)
+        grip = (("pickup", ON_GROUND, before), moved, ("place", ON_GROUND, after), ("release", FREE, lifted))
+        for name, state, (on, beneath) in grip:
+            steps.append(Subtask(len(steps), name, obj, state, index, on, beneath))
+    return tuple(steps)
 
 
 WEIGHT, WIDTH, HEIGHT, FRICTION = "weight", "width", "height", "friction"
@@ -134,8 +146,8 @@ def is_property(unknown: Unknown) -> bool:
     return unknown[0] in PROPERTIES or unknown[0].startswith(FRICTION_ON)
 
 
-def balance(index: int, state: ContactState, loads: int = 1) -> list[Equation]:
-    """Quasistatic equations of subtask `index`, at `loads` different vertical forces.
+def balance(step: Subtask, loads: int = 1) -> list[Equation]:
+    """Quasistatic equations of a subtask, at `loads` different vertical forces.
 
     Geometry: the fingers' distance is the width; the height of each finger is that of the object's bottom
     plus that of the grip on it, which is constant throughout one move. Forces: the fingers' net vertical
@@ -143,24 +155,24 @@ def balance(index: int, state: ContactState, loads: int = 1) -> list[Equation]:
     push = friction x load (Coulomb), linearised about given loads; their values are arbitrary, distinct
     numbers, as only rank matters.
     """
-    if not state.held:
+    if step.state == FREE or step.object is None:
         return []
-    name, grasp = state.object, str(state.move)
-    bottom: list[Unknown] = [(HEIGHT, below) for below in state.beneath]
-    if state.support is None:
+    index, name, grasp = step.index, step.object, str(step.move)
+    bottom: list[Unknown] = [(HEIGHT, below) for below in step.beneath]
+    if step.support is None:
         bottom = [("lift", str(index))]
     equations = [_equation({(WIDTH, name): 1}, Source(index, X_POSITIONS))]
     for finger in FINGERS:
         held = dict.fromkeys([*bottom, ("grip", finger, grasp)], 1)
         equations.append(_equation(held, Source(index, Y_POSITIONS)))
-    if state.support is None:
+    if step.support is None:
         return [*equations, _equation({(WEIGHT, name): 1}, Source(index, Y_FORCES))]
     for sample in range(loads):
         load, push = ("load", str(index), str(sample)), ("push", str(index), str(sample))
         equations.append(_equation({(WEIGHT, name): 1, load: -1}, Source(index, Y_FORCES, sample)))
         equations.append(_equation({push: 1}, Source(index, X_FORCES, sample)))
-        if state.name == SLIDING:
-            friction = (FRICTION_ON + state.support, name)
+        if step.state == SLIDING:
+            friction = (FRICTION_ON + step.support, name)
             equations.append({push: Fraction(1), load: Fraction(-1, 3), friction: Fraction(-sample - 2)})
     return equations
 
@@ -190,34 +202,6 @@ def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> 
             if len(unknown(row)) == 1 and not isinstance(pivot, Source)}  # fmt: skip
 
 
-def labelled(subtask: str, obj: str | None) -> str:
-    """A subtask with its object, such as `carry block1`; only its name if it has none."""
-    return subtask if obj is None else f"{subtask} {obj}"
-
-
-@dataclass(frozen=True)
-class Subtask:
-    """One step of a task: its name, contact state and manipulated object.
-
-    `move`: 0-based index in `task.performed` of its move (None in a plain ordered task); a pregrasp belongs
-    to the first move, a release to the move it ends. `support`: what the held object touches besides the
-    fingers, None while free or lifted; `constraints`: active contacts of the hand and the held object.
-    """
-
-    index: int
-    name: str
-    object: str | None
-    state: str
-    move: int | None
-    support: str | None = None
-    constraints: tuple[str, ...] = ()
-
-    @property
-    def label(self) -> str:
-        """Its name in the interface, such as `carry block1`."""
-        return labelled(self.name, self.object)
-
-
 @dataclass(frozen=True)
 class Evidence:
     """One way to learn a property: the signals of the subtasks required together.
@@ -241,6 +225,12 @@ class Evidence:
         wanted = (s.signal for s in self.sources if subtask in (None, s.subtask))
         return tuple(sorted(set(wanted)))
 
+    def terms(self) -> dict[str, Any]:
+        """What is learned and required, for JSON."""
+        return {"kind": "bound" if self.bound else "value",
+                "given": [f"{owner}.{name}" for name, owner in self.given],
+                "condition": self.condition}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Property:
@@ -262,6 +252,11 @@ class Property:
             return None
         return "bound" if all(evidence.bound for evidence in self.evidence) else "value"
 
+    def to_json(self) -> dict[str, Any] | None:
+        """Its entry in `decompose`'s JSON document."""
+        ways = [{"subtasks": e.subtasks, "signals": e.signals(), **e.terms()} for e in self.evidence]
+        return {"kind": self.kind, "evidence": ways} if ways else None
+
 
 @dataclass(frozen=True, repr=False)
 class Decomposition(Tabled):
@@ -272,10 +267,15 @@ class Decomposition(Tabled):
     properties: dict[str, dict[str, Property]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
+    @property
+    def entries(self) -> list[Property]:
+        """All properties of all objects."""
+        return [entry for entries in self.properties.values() for entry in entries.values()]
+
     def reveals(self, index: int) -> list[tuple[Property, Evidence]]:
         """Properties that subtask `index` helps to reveal, each with its first such evidence."""
         pairs = []
-        for entry in (entry for entries in self.properties.values() for entry in entries.values()):
+        for entry in self.entries:
             evidence = next((e for e in entry.evidence if index in e.subtasks), None)
             if evidence is not None:
                 pairs.append((entry, evidence))
@@ -303,34 +303,101 @@ class Decomposition(Tabled):
         first = {0} if moves else set()  # delimits whichever move is the first to stay
         return tuple(s for s in self.subtasks if s.index in useful | delimiting | first)
 
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why a property cannot be revealed, by `object.property`."""
+        return {f"{p.object}.{p.name}": p.reason for p in self.entries if p.reason is not None}
+
+    def cell(self, index: int, entry: Property, evidence: Evidence) -> str:
+        """Signals of subtask `index` that reveal a property; parentheses mark what goes beyond the paper."""
+        partners = [str(other + 1) for other in evidence.subtasks if other != index]
+        signals = " and ".join(evidence.signals(index)).replace("horizontal forces and", "horizontal and")
+        text = (">= " if evidence.bound else "") + signals
+        if entry.object != self.subtasks[index].object:
+            text = f"{entry.object}: {text}"
+        if partners:
+            text += f", with {', '.join(partners)}"
+        if evidence.condition:
+            text += f"; {evidence.condition}"
+        return text if self.in_paper(index, entry) else f"({text})"
+
+    def equation(self) -> str:
+        """The decomposition in the notation of the paper's equation 1: subtask = (state, {properties})."""
+        numbered = {name: re.fullmatch(r"(.*?)(\d+)", name) for name in self.properties}
+        label = {name: name for name in numbered}
+        if len({match[1] for match in numbered.values() if match}) == 1 and all(numbered.values()):
+            label = {name: match[2] for name, match in numbered.items() if match}  # block1: 1
+        parts = []
+        for s in self.subtasks:
+            revealed = [entry for entry, _ in self.reveals(s.index) if self.in_paper(s.index, entry)]
+            names = [f"{entry.name.replace('_', ' ')} {label[entry.object]}" for entry in revealed]
+            subject = s.name if s.object is None else f"{s.name.capitalize()} {label[s.object]}"
+            state = s.state if s.object is None or s.state == FREE else f"{s.state} {label[s.object]}"
+            parts.append(f"{subject} = ({state}, {{{', '.join(names) or '∅'}}})")
+        return "T = { " + ",\n      ".join(parts) + " }"
+
     def to_json(self) -> dict[str, Any]:
         """The body of `decompose`'s JSON document."""
-        from hmmseg.contact.tables import decomposition_document
-
-        return decomposition_document(self)
+        document: dict[str, Any] = {
+            "subtasks": [
+                {
+                    "index": subtask.index,
+                    "subtask": subtask.name,
+                    "object": subtask.object,
+                    "state": subtask.state,
+                    "move": None if subtask.move is None else subtask.move + 1,
+                    "support": subtask.support,
+                    "constraints": subtask.constraints,
+                    "properties": [
+                        {"property": f"{entry.object}.{entry.name}",
+                         "signals": evidence.signals(subtask.index),
+                         "with": [other for other in evidence.subtasks if other != subtask.index],
+                         **evidence.terms(),
+                         "in_paper": self.in_paper(subtask.index, entry)}
+                        for entry, evidence in self.reveals(subtask.index)
+                    ],
+                }
+                for subtask in self.subtasks
+            ],
+            "minimal": [subtask.index for subtask in self.minimal()],
+            "equation": self.equation(),
+            "properties": {
+                name: {key: entry.to_json() for key, entry in entries.items()}
+                for name, entries in self.properties.items()
+            },
+            "reasons": self.reasons,
+            "notes": self.notes,
+        }  # fmt: skip
+        if isinstance(self.task, BlockTask):
+            rises = height_equations(self.task)
+            document["height_equations"] = [{"move": index + 1, "rise": rise} for index, rise in rises]
+            document["repeat"] = self.task.repeat
+        return document
 
     def tables(self) -> list[Any]:
-        """The subtasks and what each reveals."""
-        from hmmseg.contact.tables import decomposition_table
+        """The paper's Table 1; in parentheses, what the balance gives beyond it."""
+        from rich.table import Table
 
-        return [decomposition_table(self)]
+        columns = [WEIGHT, WIDTH, HEIGHT, FRICTION] if self.properties else []
+        if any(entry.name.startswith(FRICTION_ON) for entry in self.entries):
+            columns.append(FRICTION_ON)
+        heads = {FRICTION: "Friction of fingers", FRICTION_ON: "Friction on support"}
+        caption = "Parentheses: derivable, though not in the paper's table. >=: a lower bound."
+        table = Table(caption=caption if columns else None, show_lines=bool(columns))
+        for head in ("", "Subtask", "State"):
+            table.add_column(head, no_wrap=True)
+        for column in columns:
+            table.add_column(heads.get(column, column.capitalize()))
+        for subtask in self.subtasks:
+            cells = {column: "" for column in columns}
+            for entry, evidence in self.reveals(subtask.index):
+                column = FRICTION_ON if entry.name.startswith(FRICTION_ON) else entry.name
+                cells[column] = self.cell(subtask.index, entry, evidence)
+            table.add_row(str(subtask.index + 1), subtask.label, subtask.state, *cells.values())
+        return [table]
 
 
 VARYING_LOAD = "the vertical force must vary while the object slides"
-
-
-def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
-    """The ordered subtasks of a task."""
-    if isinstance(task, SequenceTask):
-        return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
-    named, held = [], False
-    for i, state in enumerate(contact_states(task)):
-        names = {FREE: "release" if i else "pregrasp", ON_GROUND: "place" if held else "pickup",
-                 SLIDING: "slide", ABOVE_GROUND: "carry"}  # fmt: skip
-        named.append(Subtask(i, names[state.name], state.object, state.name, state.move, state.support,
-                             state.constraints))  # fmt: skip
-        held = state.held
-    return tuple(named)
 
 
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
@@ -345,10 +412,10 @@ def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
         (0-based index of the move, {object: coefficient}) per move: bottom height at place less that
         at pickup. The rise of a slide is {}.
     """
-    held, equations = [state for state in contact_states(task) if state.held], []
-    for start, _, end in zip(held[::3], held[1::3], held[2::3], strict=True):
+    held, equations = [step for step in subtasks(task) if step.state != FREE], []
+    for move, (start, end) in enumerate(zip(held[::3], held[2::3], strict=True)):
         rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}
-        equations.append((start.move, {name: value for name, value in rise.items() if value}))
+        equations.append((move, {name: value for name, value in rise.items() if value}))
     return equations
 
 
@@ -357,8 +424,8 @@ def decompose(task: AnyTask) -> Decomposition:
     if isinstance(task, SequenceTask):
         note = "a plain ordered task has no block physics: no properties"
         return Decomposition(task, subtasks(task), notes=(note,))
-    states = list(contact_states(task))
-    learned = _learn(states)
+    steps = subtasks(task)
+    learned = _learn(steps)
     properties: dict[str, dict[str, Property]] = {}
     for name in task.objects:
         rubbed = [key for key, owner in learned if owner == name and key.startswith(FRICTION_ON)]
@@ -366,71 +433,69 @@ def decompose(task: AnyTask) -> Decomposition:
         for key in (*PROPERTIES, FRICTION, *sorted(set(rubbed))):
             ways = learned.get((key, name), ())
             evidence = tuple(sorted(ways, key=lambda e: (e.bound, e.condition is not None, e.subtasks)))
-            reason = None if evidence else _reason(task, states, name, key)
+            reason = None if evidence else _reason(task, steps, name, key)
             properties[name][key] = Property(name, key, evidence, reason)
     notes = ()
     if task.repeat == "unknown":
         notes = ("the moves repeat as often as the recording shows; one round is decomposed",)
-    return Decomposition(task, subtasks(task), properties, notes)
+    return Decomposition(task, steps, properties, notes)
 
 
-def _learn(states: list[ContactState]) -> dict[Unknown, list[Evidence]]:
-    """Every way to learn each property, from the contact states in order."""
+def _learn(steps: Sequence[Subtask]) -> dict[Unknown, list[Evidence]]:
+    """Every way to learn each property."""
     learned: dict[Unknown, list[Evidence]] = {}
-    moves: dict[object, list[list[int]]] = {}  # moves with equal contacts determine equal properties
-    for _, group in itertools.groupby((i for i, s in enumerate(states) if s.held), lambda i: states[i].move):
-        indices = list(group)
-        contacts = tuple((states[i].constraints, states[i].beneath) for i in indices)
-        moves.setdefault(contacts, []).append(indices)
+    moves: dict[object, list[list[Subtask]]] = {}  # moves with equal contacts determine equal properties
+    for _, group in itertools.groupby((s for s in steps if s.state != FREE), lambda s: s.move):
+        move = list(group)
+        moves.setdefault(tuple((s.constraints, s.beneath) for s in move), []).append(move)
     for alike in moves.values():
-        _learn_within(states, alike, learned)
-    equations = [e for alike in moves.values() for i in alike[0] for e in balance(i, states[i])]
+        _learn_within(alike, learned)
+    equations = [e for alike in moves.values() for s in alike[0] for e in balance(s)]
     for unknown, row in determined(equations).items():
         if unknown[0] in PROPERTIES:
             learned.setdefault(unknown, [_evidence(row)])
-    for index in itertools.chain.from_iterable(itertools.chain.from_iterable(moves.values())):
-        _learn_friction(index, states[index], learned)
+    for step in itertools.chain.from_iterable(itertools.chain.from_iterable(moves.values())):
+        _learn_friction(step, learned)
     return learned
 
 
-def _learn_within(states: list[ContactState], alike: list[list[int]],
-                  learned: dict[Unknown, list[Evidence]]) -> None:  # fmt: skip
-    """What single subtasks of a move determine, and what only pairs of them do."""
+def _learn_within(alike: list[list[Subtask]], learned: dict[Unknown, list[Evidence]]) -> None:
+    """What single subtasks of moves with equal contacts determine, and what only pairs of them do."""
     first, alone = alike[0], set()
     for size in (1, 2):
         for subset in itertools.combinations(first, size):
-            rows = determined(e for i in subset for e in balance(i, states[i]))
+            rows = determined(e for s in subset for e in balance(s))
             for unknown in filter(is_property, rows):
                 if size == 1:
                     alone.add(unknown)
                 elif unknown in alone:
                     continue
-                for indices in alike:
-                    moved = dict(zip(first, indices, strict=True))
+                for move in alike:
+                    moved = {a.index: b.index for a, b in zip(first, move, strict=True)}
                     learned.setdefault(unknown, []).append(_evidence(rows[unknown], moved))
 
 
-def _learn_friction(index: int, state: ContactState, learned: dict[Unknown, list[Evidence]]) -> None:
-    """Friction at the contacts of one state, determined where the contact forces are known.
+def _learn_friction(step: Subtask, learned: dict[Unknown, list[Evidence]]) -> None:
+    """Friction at the contacts of one subtask, determined where the contact forces are known.
 
     A fingertip's forces are measured; a support's follow from the balance once the weight is given. Slip
     determines the coefficient, sticking bounds it from below.
     """
-    forces = (Source(index, X_FORCES), Source(index, Y_FORCES))
-    learned.setdefault((FRICTION, state.object), []).append(Evidence(forces, bound=True))
-    if state.support is None:
+    forces, name = (Source(step.index, X_FORCES), Source(step.index, Y_FORCES)), str(step.object)
+    learned.setdefault((FRICTION, name), []).append(Evidence(forces, bound=True))
+    if step.support is None:
         return
-    friction = (FRICTION_ON + state.support, state.object)
-    target = friction if state.name == SLIDING else ("load", str(index), "0")
-    equations = balance(index, state)
+    friction = (FRICTION_ON + step.support, name)
+    target = friction if step.state == SLIDING else ("load", str(step.index), "0")
+    equations = balance(step)
     unknowns = {key for equation in equations for key in equation if not isinstance(key, Source)}
     given = {key for key in unknowns if any(way.condition is None for way in learned.get(key, ()))}
     given -= {friction}
     if target in determined(equations, given):
         needed = tuple(u for u in given if target not in determined(equations, given - {u}))
-        learned.setdefault(friction, []).append(Evidence(forces, state.name != SLIDING, needed))
+        learned.setdefault(friction, []).append(Evidence(forces, step.state != SLIDING, needed))
         return
-    for unknown, row in determined(balance(index, state, loads=3), given).items():
+    for unknown, row in determined(balance(step, loads=3), given).items():
         if is_property(unknown):
             learned.setdefault(unknown, []).append(_evidence(row, condition=VARYING_LOAD))
 
@@ -442,7 +507,7 @@ def _evidence(
     return Evidence(tuple(Source(*source) for source in sorted(used)), condition=condition)
 
 
-def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str) -> str:
+def _reason(task: BlockTask, steps: Iterable[Subtask], name: str, key: str) -> str:
     """Why nothing reveals a property, in plain words."""
     if key == HEIGHT:
         rises = {str(i + 1): rise for i, rise in height_equations(task) if name in rise}
@@ -451,6 +516,6 @@ def _reason(task: BlockTask, states: Iterable[ContactState], name: str, key: str
         move, rise = next(iter(rises.items()))
         others = ", ".join(sorted(set(rise) - {name}))
         return f"move {move} changes heights by {name}'s only together with the height of {others}"
-    if not any(state.held and state.object == name for state in states):
+    if not any(step.state != FREE and step.object == name for step in steps):
         return f"no recorded move grips {name}"
     return f"no recorded move lifts {name} clear of its support"

@@ -31,7 +31,7 @@ from hmmseg.io.trial import (
     mapped_times,
     trial_of,
 )
-from hmmseg.io.units import UNITS, Column, known_unit, measures, unit_in_name
+from hmmseg.io.units import UNITS, Column, measures, unit_in_name
 from hmmseg.levels import GAP
 
 BUCKETS = 24  # numerics: of a small plot
@@ -73,7 +73,7 @@ class Inspection:
     channels: tuple[Channel, ...]
     mapping: dict[str, dict[str, Any]]
     toml: str
-    said: tuple[str, ...]
+    remarks: tuple[str, ...]
     understood: bool
 
 
@@ -85,29 +85,27 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
         raise InputError(str(path), "is empty", "a header row and a row for every sample")
     already = {} if rig is None else (rig.topics if table.messages else rig.columns)
     entries = {} if already else propose(table)
-    entries, said = correct(table, entries, rig)
+    entries, remarks = correct(table, entries, rig)
     by_length: dict[int, list[str]] = {}
     for name, values in table.columns.items():
         by_length.setdefault(len(values), []).append(name)
     others = f"not {table.rows.size} as the others: they are not read together"
     odd = [f"columns {', '.join(names)} have {length} rows, {others}"
            for length, names in by_length.items() if length != table.rows.size]  # fmt: skip
-    said = [*table.notes, *(f"{path}: {line}" for line in (*odd, *said))]
+    remarks = [*table.notes, *(f"{path}: {line}" for line in (*odd, *remarks))]
     toml = as_toml(entries, table) if entries else ""
     if set(entries) <= {"t"} and not already and (rig is None or rig.gripper is None):
         toml = propose_gripper(table, entries) or toml
     t, origin = _clock(table, entries, rig)
     channels = tuple(_channel(table, name, t) for name in table.names if name in table.columns)
-    gaps: list[tuple[float, float]] = []
-    rate, ends = None, (None, None) if t is None or not t.size else (float(t[0]), float(t[-1]))
-    if t is not None and t.size > 2:
-        steps = np.diff(t)
-        rate = float(1 / np.median(steps)) if np.median(steps) > 0 else None
-        wide = np.flatnonzero(steps > GAP * np.median(steps))
-        gaps = [(float(t[i]), float(t[i + 1])) for i in wide]
+    start, end, rate, gaps = None, None, None, ()
+    if t is not None:
+        period = np.median(np.diff(t))
+        start, end, rate = float(t[0]), float(t[-1]), float(1 / period)
+        gaps = tuple((float(t[i]), float(t[i + 1])) for i in np.flatnonzero(np.diff(t) > GAP * period))
     return Inspection(
-        str(path), tuple(parts), int(table.rows.size), *ends, rate, origin, tuple(gaps), channels, entries,
-        toml, tuple(said), not toml and _understood(table, rig),
+        str(path), tuple(parts), int(table.rows.size), start, end, rate, origin, gaps, channels, entries,
+        toml, tuple(remarks), not toml and _understood(table, rig),
     )  # fmt: skip
 
 
@@ -142,7 +140,7 @@ def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
         return Channel(name, unit, None, len(table.columns[name]), 0, 0, None, None, (), text=True)
     there = values[np.isfinite(values)]
     rate = table.rates.get(name)
-    if rate is None and t is not None and t.size > 2 and t[-1] > t[0]:
+    if rate is None and t is not None:
         rate = float((there.size - 1) / (t[-1] - t[0]))
     low, high = (float(there.min()), float(there.max())) if there.size else (None, None)
     pieces = [p[np.isfinite(p)] for p in np.array_split(values, min(BUCKETS, max(values.size, 1)))]
@@ -183,10 +181,9 @@ def propose(table: Table) -> dict[str, dict[str, Any]]:
             break
     out: dict[str, dict[str, Any]] = {}
     for channel, source in sources.items():
-        unit = table.units.get(source) or unit_in_name(source)
-        wanted = measures(channel)
-        fits = unit is not None and (wanted is None or UNITS[known_unit(unit) or ""][0] == wanted)
-        fields = {"from": source} | ({"unit": unit} if fits and UNITS[unit or ""][1] != 1 else {})
+        unit, fields = table.units.get(source) or unit_in_name(source), {"from": source}
+        if unit is not None and UNITS[unit][0] == measures(channel) and UNITS[unit][1] != 1:
+            fields["unit"] = unit
         if fields != {"from": channel}:
             out[channel] = fields
     return out
@@ -199,7 +196,7 @@ def correct(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = 
     Without a rig the lengths of links are unknown, so that a jointed hand is checked only with its rig.
     """
     rig = rig or Rig()
-    said: list[str] = []
+    remarks: list[str] = []
     for _ in range(8):
         mapping = {name: Column.model_validate(fields) for name, fields in entries.items()}
         where = "topics" if table.messages else "columns"
@@ -210,14 +207,14 @@ def correct(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None = 
             try:
                 clock = Trial(table.file, mapped_times(table, hand)[0], {})
             except InputError:
-                return entries, said
+                return entries, remarks
             found = [replace(f, certain=True) for f in check_clock(clock, hand, moving=False) if f.changes]
-        said += [line for f in found if (line := f"column {f.channel} {f.problem}") not in said]
+        remarks += [line for f in found if (line := f"column {f.channel} {f.problem}") not in remarks]
         fresh = {k: v for f in found if f.certain or f.channel == "t" for k, v in f.changes.items()}
         if not fresh or all(entries.get(name) == fields for name, fields in fresh.items()):
-            return entries, said
+            return entries, remarks
         entries = {**entries, **fresh}
-    return entries, said
+    return entries, remarks
 
 
 def as_toml(entries: Mapping[str, Mapping[str, Any]], table: Table) -> str:
@@ -358,7 +355,7 @@ def propose_gripper(table: Table, entries: Mapping[str, Mapping[str, Any]]) -> s
     mapped = {name: dict(fields) for name, fields in entries.items()}
     for name in used:
         unit = table.units.get(name) or unit_in_name(name)
-        if unit and UNITS.get(known_unit(unit) or "", ("", 1.0))[1] != 1:
+        if unit and UNITS[unit][1] != 1:
             mapped[name] = {"from": name, "unit": unit}
     return "\n".join(lines) + "\n" + (as_toml(mapped, table) if mapped else "")
 

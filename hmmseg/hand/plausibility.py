@@ -61,7 +61,7 @@ def entry_text(channel: str, fields: dict[str, Any]) -> str:
 
 
 def exchanged(
-    stems: tuple[str, ...], pair: tuple[str, str], trial: Trial, rig: Rig | None
+    stems: tuple[str, ...], pair: tuple[str, str], trial: Trial, rig: Rig
 ) -> dict[str, dict[str, Any]]:
     """Entries that exchange the sources of a pair of fingers or axes.
 
@@ -136,9 +136,9 @@ def judge(trial: Trial, findings: Iterable[Finding]) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
+def check_lengths(trial: Trial, rig: Rig) -> list[Finding]:
     """Positions in mm or cm (no hand travels so far), or in km."""
-    gripper = None if rig is None else rig.gripper
+    gripper = rig.gripper
     names = ("x1", "y1", "x2", "y2") if gripper is None else gripper.position.values()
     travels = {
         name: float(np.nanmax(values) - np.nanmin(values))
@@ -163,7 +163,7 @@ def check_lengths(trial: Trial, rig: Rig | None) -> list[Finding]:
     return []
 
 
-def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
+def check_angles(trial: Trial, rig: Rig) -> list[Finding]:
     """Joint angles in degrees: no link winds twice around."""
     named = [name for name in ("q11", "q12", "q21", "q22") if name in trial.channels]
     joints = [name for name in named if np.isfinite(trial.channels[name]).any()]
@@ -180,7 +180,7 @@ def check_angles(trial: Trial, rig: Rig | None) -> list[Finding]:
     return [Finding(name, problem, changes)]
 
 
-def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
+def check_velocities(trial: Trial, rig: Rig) -> list[Finding]:
     """Velocities that are the positions' derivatives times a factor of units, or of the other sign."""
     factors = {"q": ((180 / np.pi, "deg/s"), (1e3, "mrad/s")), "x": ((1e3, "mm/s"), (1e2, "cm/s"))}
     found: dict[str, tuple[float, dict[str, object]]] = {}
@@ -199,7 +199,7 @@ def check_velocities(trial: Trial, rig: Rig | None) -> list[Finding]:
     return [Finding(name, text, changes)]
 
 
-def check_forces(trial: Trial, rig: Rig | None) -> list[Finding]:
+def check_forces(trial: Trial, rig: Rig) -> list[Finding]:
     """Forces in mN or kN: no fingertip presses so hard, or holds anything so softly."""
     names = [name for name in FORCE_CHANNELS if name in trial.channels]
     there = [np.abs(v[np.isfinite(v)]) for v in (trial.channels[name] for name in names)]

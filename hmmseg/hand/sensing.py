@@ -58,8 +58,8 @@ def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
     if stated is not None:
         likely = _nearest_unit(stated / inertia)[1] > np.log(2)
     if likely and tool.weighed and abs(tool.mass / tool.inertia - 1) > NEAR:
-        said = "is stated to weigh" if stated is not None else "weighs, as it turns,"
-        return (f"{where}: the tool {said} {tool.mass:.3g} kg and moves like one of {tool.inertia:.3g} kg; "
+        basis = "is stated to weigh" if stated is not None else "weighs, as it turns,"
+        return (f"{where}: the tool {basis} {tool.mass:.3g} kg and moves like one of {tool.inertia:.3g} kg; "
                 "expected one mass: gains, axes or tool_mass under [gripper] are wrong",)  # fmt: skip
     if likely:
         return ()

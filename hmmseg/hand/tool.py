@@ -326,8 +326,8 @@ def order_warnings(trial: Trial, rig: Rig, tool: Tool, free: np.ndarray) -> tupl
 
     Only for a hand that turns enough to weigh its tool apart from the sensor's offset; else any order fits.
     """
-    gripper = rig.gripper
-    if gripper is None or gripper.quaternion is None or not tool.weighed:
+    gripper = rig.wrist
+    if gripper.quaternion is None or not tool.weighed:
         return ()
     rolled = (*gripper.quaternion[1:], gripper.quaternion[0])
     other = gripper.model_copy(update={"quaternion": rolled})

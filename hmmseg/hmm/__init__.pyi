@@ -3,13 +3,13 @@ from hmmseg.hmm.chain import InfeasibleAlignment as InfeasibleAlignment
 from hmmseg.hmm.chain import left_to_right as left_to_right
 from hmmseg.hmm.durations import DurationChain as DurationChain
 from hmmseg.hmm.durations import lasting as lasting
+from hmmseg.hmm.inference import em as em
 from hmmseg.hmm.inference import filter as filter
 from hmmseg.hmm.inference import k_best as k_best
 from hmmseg.hmm.inference import log_evidence as log_evidence
 from hmmseg.hmm.inference import sample as sample
 from hmmseg.hmm.inference import smooth as smooth
 from hmmseg.hmm.inference import viterbi as viterbi
-from hmmseg.hmm.learn import em as em
 from hmmseg.hmm.results import Alignment as Alignment
 from hmmseg.hmm.results import Alignments as Alignments
 from hmmseg.hmm.results import Filtered as Filtered

@@ -148,7 +148,13 @@ def _refuse_bad(name: str, weights: Any) -> None:
     if isinstance(weights, Tracer):
         return
     if weights.size and not weights.max() < np.inf:
-        raise ValueError(f"{name}: {_first_bad(np.asarray(weights))}, expected numbers or -inf")
+        raise not_a_number(name, np.isnan(weights) | np.isposinf(weights))
+
+
+def not_a_number(name: str, where: np.ndarray, hint: str = "") -> ValueError:
+    """The exception for NaN or +inf in a table, true in `where`."""
+    place = np.argwhere(where)[0].tolist()
+    return ValueError(f"{name}: NaN or +inf at {place}, expected numbers or -inf{hint}")
 
 
 def left_to_right(mean_samples: ArrayLike, presence: ArrayLike | None = None) -> Chain:
@@ -193,11 +199,9 @@ def jumps_between(presence: ArrayLike) -> tuple[list[np.ndarray], np.ndarray, np
     return jumps, initial, final
 
 
-def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:
-    """The exception for a chain without any path: ValueError for +inf, else InfeasibleAlignment."""
+def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> InfeasibleAlignment:
+    """The exception that names the state at fault where no path has any weight."""
     ll = np.asarray(log_likelihoods)
-    if np.isposinf(ll).any():
-        return ValueError(f"log_likelihoods: {_first_bad(ll)}, expected numbers or -inf")
     possible = ~np.isneginf(ll)  # a row of NaN is no evidence
     reach = np.isfinite(chain.log_initial) & possible[0]
     reached = reach.copy()
@@ -218,15 +222,3 @@ def why_infeasible(log_likelihoods: np.ndarray, chain: Chain) -> ValueError:
     if len(ll) <= starving:
         return InfeasibleAlignment(starving, f"{len(ll)} samples are too few")
     return InfeasibleAlignment(starving, "no path reaches it")
-
-
-def not_numbers(log_likelihoods: np.ndarray, row: int) -> ValueError:
-    """The exception for a row with NaN beside numbers."""
-    column = int(np.flatnonzero(np.isnan(np.asarray(log_likelihoods[row], dtype=float)))[0])
-    where = f"log_likelihoods: NaN or +inf at {[row, column]}"
-    return ValueError(f"{where}, expected numbers or -inf (a missing sample is NaN throughout)")
-
-
-def _first_bad(table: np.ndarray) -> str:
-    where = np.argwhere(np.isnan(table) | np.isposinf(table))[0].tolist()
-    return f"NaN or +inf at {where}"

@@ -252,11 +252,8 @@ def rank(x: Array, chain: DurationChain, n: Array, count: int) -> tuple[Array, A
     return jax.vmap(back)(ends), log_prob
 
 
-def why_infeasible(x: np.ndarray, chain: DurationChain) -> ValueError:
-    """The exception for a chain without any path: ValueError for +inf, else InfeasibleAlignment."""
-    if np.isposinf(x).any():
-        return ValueError(f"log_likelihoods: +inf at {np.argwhere(np.isposinf(x))[0].tolist()}, "
-                          "expected numbers or -inf")  # fmt: skip
+def why_infeasible(x: np.ndarray, chain: DurationChain) -> InfeasibleAlignment:
+    """The exception that names the state at fault where no path has any weight."""
     with jax.enable_x64(True):
         enter = np.asarray(_forward(jnp.asarray(x), _arrays(chain), jnp.int32(len(x)))[1])
     deepest = int(np.flatnonzero(np.isfinite(enter).any(axis=0)).max(initial=0))

@@ -15,8 +15,9 @@ are in double precision, whatever the process's JAX setting. Every function can 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from hmmseg.hmm import durations, recursions
-from hmmseg.hmm.chain import Chain, not_numbers, why_infeasible
+from hmmseg.hmm.chain import Chain, not_a_number, why_infeasible
 from hmmseg.hmm.durations import DurationChain
 from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filtered, Posterior
 
@@ -241,11 +242,18 @@ def checked(log_likelihoods: ArrayLike, chain: AnyChain) -> np.ndarray:
     ll = np.asarray(log_likelihoods, dtype=np.float64)
     _check_shape(ll, chain)
     missing = np.isnan(ll)
-    if missing.any():
-        partly = missing.any(1) & ~missing.all(1)
-        if partly.any():
-            raise not_numbers(ll, int(partly.argmax()))
+    partly = missing & ~missing.all(1, keepdims=True)
+    if partly.any():
+        raise not_a_number("log_likelihoods", partly, " (a missing sample is NaN throughout)")
     return ll
+
+
+def _failure(x: np.ndarray, chain: AnyChain) -> ValueError:
+    """The exception for a recording without a finite log weight."""
+    if np.isposinf(x).any():
+        return not_a_number("log_likelihoods", np.isposinf(x))
+    why: Callable = durations.why_infeasible if isinstance(chain, DurationChain) else why_infeasible
+    return why(x, chain)
 
 
 def _check_shape(ll: Any, chain: AnyChain) -> None:
@@ -313,20 +321,9 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any]
                 totals, batch = jax.tree.map(np.asarray, program(x, chain, n, *keys))
             for j, i in enumerate(part):
                 if not np.isfinite(totals[j]):
-                    why = durations.why_infeasible if isinstance(chains[i], DurationChain) else why_infeasible
-                    raise why(tables[i], chains[i])
+                    raise _failure(tables[i], chains[i])
                 results[i] = _trimmed(jax.tree.map(lambda leaf, j=j: leaf[j], batch), len(tables[i]))
     return results
-
-
-def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> list[AlignmentPosterior]:
-    """`viterbi` and `smooth` of several recordings, as used by EM."""
-    return [
-        AlignmentPosterior(
-            posterior.log_evidence, posterior.smoothed, posterior.moves, best.path, best.log_prob
-        )
-        for best, posterior in run_many(_align, *recordings(log_likelihoods, chains, None))
-    ]
 
 
 @cache
@@ -370,3 +367,69 @@ def _trimmed(result: Any, n: int) -> Any:
     if isinstance(result, Alignments):
         return Alignments(result.starts.astype(np.int64), result.num_samples, result.log_prob)
     return float(result)
+
+
+# Expectation maximisation.
+
+
+def align(log_likelihoods: Sequence[np.ndarray], chains: Sequence[Chain]) -> list[AlignmentPosterior]:
+    """`viterbi` and `smooth` of several recordings, as used by EM."""
+    return [
+        AlignmentPosterior(
+            posterior.log_evidence, posterior.smoothed, posterior.moves, best.path, best.log_prob
+        )
+        for best, posterior in run_many(_align, *recordings(log_likelihoods, chains, None))
+    ]
+
+
+M = TypeVar("M")
+LEAST_ITERATIONS = 6  # numerics: before the evidence may have settled
+
+
+@dataclass(frozen=True)
+class Learned(Generic[M]):
+    """A fitted model, with every trial's most probable path and posterior under it."""
+
+    model: M
+    alignments: tuple[AlignmentPosterior, ...]
+    converged: bool = False
+
+    @property
+    def log_evidence(self) -> float:
+        """Log evidence of all trials [nats]."""
+        return sum(each.log_evidence for each in self.alignments)
+
+
+def em(model: M, tables: Callable[[M], tuple[Sequence[np.ndarray], Sequence[Chain]]],
+       updated: Callable[[M, Sequence[np.ndarray]], M], max_iterations: int = 40,
+       tolerance: float = 1e-3) -> Learned[M]:  # fmt: skip
+    """Alternate expectation and maximisation until the log evidence changes by less than `tolerance` nats.
+
+    The last step is an expectation. Trials of any lengths are pooled; emissions and durations are up to the
+    caller (those by a network need no such driver, as `log_evidence` has a gradient). Dempster, Laird and
+    Rubin, J. R. Stat. Soc. B 39, 1977; Rabiner, Proc. IEEE 77(2), 1989.
+
+    Args:
+        model: initial model.
+        tables: maps a model to each trial's log-likelihoods (num_timesteps, num_states), -inf for impossible
+            states, and its chain.
+        updated: the M-step: a new model, given each trial's posterior state probabilities.
+        max_iterations: limit, after which the result is unconverged.
+        tolerance: nats.
+
+    Returns:
+        The final model.
+
+    Raises:
+        InfeasibleAlignment: a trial is too short for its states.
+        ValueError: NaN.
+    """
+    before = -np.inf
+    for iteration in range(1, max_iterations + 1):
+        fit = Learned(model, tuple(align(*tables(model))))
+        if iteration > LEAST_ITERATIONS and abs(fit.log_evidence - before) < tolerance:
+            return Learned(model, fit.alignments, converged=True)
+        if iteration < max_iterations:
+            before = fit.log_evidence
+            model = updated(model, [each.smoothed for each in fit.alignments])
+    return fit

@@ -6,8 +6,6 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from hmmseg.contact.decompose import FREE, UNITS, Subtask
 from hmmseg.segmentation.spans import Span
 
@@ -35,15 +33,14 @@ class Answer:
     property, mean, sd).
     """
 
-    note: str | None  # irregularity of the row, in words
+    note: str | None = None  # irregularity of the row, in words
 
-    def __init__(self, watcher: Filter, t: float, now: np.ndarray, smoothed: np.ndarray, means: np.ndarray,
-                 round_: int, departed: tuple[int, float, int], final: bool) -> None:  # fmt: skip
-        self._watcher, self.t, self.final, self.round = watcher, t, final, round_
-        self.probabilities, self.departed = now[:-1], float(now[-1])
-        self.smoothed, self._means = smoothed[:-1], means
-        self._missed, self._left_at, state = departed
-        self._contact, self.note = watcher.off_task[max(state, 0)], None
+    def __init__(self, watcher: Filter, t: float, final: bool) -> None:
+        self._watcher, self.t, self.final, self.round = watcher, t, final, watcher.round
+        self.probabilities, self.departed = watcher.now[:-1], float(watcher.now[-1])
+        self.smoothed = watcher.smoothed[:-1]
+        self._missed, self._left_at, state = watcher.departure
+        self._contact = watcher.off_task[max(state, 0)]
         self.index = int(self.probabilities.argmax())
         if self.departed > 0.5:
             self.index = self._missed
@@ -75,7 +72,7 @@ class Answer:
     @property
     def properties(self) -> list[tuple[str, str, float, float]]:
         """(object, property, mean, sd) of the properties known so far, SI units."""
-        return self._watcher.properties.table(self._means)
+        return self._watcher.properties.table(self._watcher.means)
 
     @property
     def failed(self) -> dict[str, Any] | None:

@@ -134,9 +134,10 @@ class Filter:
         )
         self._x = np.full(1, np.nan).astype(READING)
         self._x["sd_fx"], self._x["sd_fy"], self._x["gripped"] = 0.0, 0.0, 1.0
-        self._now, self._smoothed = np.zeros((2, self.num_steps + 1))
-        self._means = np.zeros((2 * len(task.objects) + len(task.moves), 3))
-        self._least, self._round, self._departed = np.array(LEAST_SPANS), 0, (0, 0.0, 0)
+        self.now, self.smoothed = np.zeros((2, self.num_steps + 1))  # as `summarise` fills them
+        self.means = np.zeros((2 * len(task.objects) + len(task.moves), 3))
+        # The heaviest hypotheses: round of the one on the task; missed subtask, time [s] and state off it.
+        self._least, self.round, self.departure = np.array(LEAST_SPANS), 0, (0, 0.0, 0)
         self._state = _State(
             *self._table, 0, np.full(ROWS, np.nan).astype(ROW), np.array([[np.inf, -np.inf]] * 4),
             np.array([(*LEAST_SPANS, 1.0, 1.0)], RANGES), np.zeros(12),
@@ -244,7 +245,7 @@ class Filter:
     def _settle(self, before: float) -> None:
         """Settle boundaries that are now older than the lag, each once."""
         s = self._state
-        while self._now[-1] < 0.5:  # nothing off the task is a boundary of it
+        while self.now[-1] < 0.5:  # nothing off the task is a boundary of it
             mean, variance, come, early = boundary(s.rows, s.count, self.num_steps, s.settled, before)
             if early < 0.5 or come <= 0:
                 return
@@ -269,7 +270,7 @@ class Filter:
         touch = before.state == FREE or after.name == "place"
         start = max(mean - REACH, previous)
         rows = [each for each in self.rows if start <= each[0] <= mean + max(self.lag, REACH)]
-        if len(rows) < 2 * NEAREST or self._now[-1] > 0.5:
+        if len(rows) < 2 * NEAREST or self.now[-1] > 0.5:
             return None
         t = np.array([each[0] for each in rows])
         if touch and 1.0 / np.median(np.diff(t)) > FINE:
@@ -333,20 +334,18 @@ class Filter:
         """The current answer."""
         s = self._state
         if not s.started:
-            self._now[:], self._smoothed[:], self._means[:] = 0.0, 0.0, 0.0
-            self._now[0] = self._smoothed[0] = 1.0
+            self.now[:], self.smoothed[:], self.means[:] = 0.0, 0.0, 0.0
+            self.now[0] = self.smoothed[0] = 1.0
         else:
             blocks, before = len(self.task.objects), s.last_t - self.lag
-            on, off = summarise(s.rows, s.known, s.count, self.num_steps, blocks, before, self._now,
-                                self._smoothed, self._means)  # fmt: skip
+            on, off = summarise(s.rows, s.known, s.count, self.num_steps, blocks, before, self.now,
+                                self.smoothed, self.means)  # fmt: skip
             if on >= 0:
-                self._round = int(s.rows["round"][on])
+                self.round = int(s.rows["round"][on])
             if off >= 0:
                 missed, left_at, state = (s.rows[name][off].item() for name in ("missed", "left_at", "state"))
-                self._departed = missed, left_at, state - self.num_steps
-        return Answer(
-            self, s.last_t, self._now, self._smoothed, self._means, self._round, self._departed, final
-        )
+                self.departure = missed, left_at, state - self.num_steps
+        return Answer(self, s.last_t, final)
 
     def finish(self) -> Answer:
         """The final answer, with all boundaries settled whatever their age."""
@@ -366,7 +365,7 @@ class Filter:
         # Structured arrays are slow to copy.
         big = s.rows[: s.count].tobytes(), s.known[: s.count].copy(), s.ring.tobytes()
         small = copy.copy(s), s.extremes.copy(), s.ranges.copy()
-        return small, big, len(self.crossings), list(self._waiting), self._now.copy()
+        return small, big, len(self.crossings), list(self._waiting), self.now.copy()
 
     def restore(self, snapshot: Any) -> list[tuple[float, np.ndarray]]:
         """Return to an earlier point; returns the rows taken since."""
@@ -374,7 +373,7 @@ class Filter:
         self._state = s = copy.copy(state)
         s.rows[: s.count], s.known[: s.count] = np.frombuffer(rows, HYPOTHESIS), known
         s.ring, s.extremes, s.ranges = np.frombuffer(ring, ROW).copy(), extremes.copy(), ranges.copy()
-        self._waiting, self._now[:] = list(waiting), now
+        self._waiting, self.now[:] = list(waiting), now
         del self.crossings[crossings:]
         since = [each for each in self.rows if each[0] > state.last_t]
         for _ in since:

@@ -170,14 +170,7 @@ def _advance(table, count, fresh, t, dt, chain):
             # another block, or another place: a departure
             h.state, h.missed, h.left_at = chain.num_steps, state, t
         table.rows[i].weight += math.log1p(-away)
-        merged = False
-        for j in range(num_new):
-            if fresh.rows[j].state == h.state:
-                absorb(fresh, j, fresh, num_new)
-                merged = True
-                break
-        if not merged:
-            num_new += 1
+        num_new = _add(fresh, num_new, fresh, num_new)
     for j in range(num_new):
         count = _add(table, count, fresh, j)
     return count
@@ -200,7 +193,6 @@ def _depart(table, count, fresh, t, dt, chain):
     log_away = math.log(-math.expm1(-dt / PACE))
     num_new = 0
     for target in range(num_steps, num_states):
-        found = -1
         for i in range(count):
             state = table.rows[i].state
             if not _may_follow(chain, state, target):
@@ -215,19 +207,13 @@ def _depart(table, count, fresh, t, dt, chain):
                 weight += LOG_DEPARTURE
             if weight < NEGLIGIBLE:
                 continue
-            at = num_new if found < 0 else num_new + 1
-            _copy(fresh, at, table, i)
-            h = fresh.rows[at]
+            _copy(fresh, num_new, table, i)
+            h = fresh.rows[num_new]
             h.weight = weight
-            _enter(h, fresh.known[at], t, dt / 2, chain, state, target)
+            _enter(h, fresh.known[num_new], t, dt / 2, chain, state, target)
             if state < num_steps:
                 h.missed, h.left_at = min(state + 1, num_steps - 1), t - dt / 2
-            if found < 0:
-                found = num_new
-            else:
-                absorb(fresh, found, fresh, at)
-        if found >= 0:
-            num_new += 1
+            num_new = _add(fresh, num_new, fresh, num_new)
     for j in range(num_new):
         count = _add(table, count, fresh, j)
     return count

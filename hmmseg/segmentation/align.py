@@ -22,14 +22,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.levels import decisive
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind
 from hmmseg.segmentation.changes import Change, discrepancies
-from hmmseg.segmentation.conformity import (
-    Conformity,
-    at,
-    examine,
-    explain,
-    plan,
-    task_boundaries,
-)
+from hmmseg.segmentation.conformity import Conformity, examine, explain, plan, point_mass, task_boundaries
 from hmmseg.segmentation.emissions import WINDOW, Features, features, thin, without
 from hmmseg.segmentation.fit import Fit, fit
 from hmmseg.segmentation.pads import LEAD_SD, Sensing, read_again, sense
@@ -37,7 +30,7 @@ from hmmseg.segmentation.posteriors import Reading, boundary_posteriors, contact
 from hmmseg.segmentation.rounds import (
     OnDisk,
     Recorded,
-    cut,
+    find_cuts,
     merge_point,
     one_round,
     part,
@@ -152,7 +145,7 @@ class Rounds:
         pieces, steps, number = self.pieces[index], self.steps, self.number
         per_round = (len(steps) - 1) // number
         boundaries = [b for piece in pieces[:number] for b in piece.boundaries]
-        boundaries += [at(last)] * (len(steps) - 1 - len(boundaries))
+        boundaries += [point_mass(last)] * (len(steps) - 1 - len(boundaries))
         present = np.zeros(len(steps), bool)
         failures, spans = [], []
 
@@ -237,7 +230,7 @@ def _rounds(
     recordings: Sequence[Recorded], coarse: Sequence[Features], task: BlockTask, rig: Rig
 ) -> tuple[list[list[slice]], list[list[Conformity]]]:
     """Samples and verdict of every round of every recording."""
-    cuts = [cut(f, task) for f in coarse]
+    cuts = [find_cuts(f, task) for f in coarse]
     while True:
         samples = [slices(r.t, at) for r, at in zip(recordings, cuts, strict=True)]
         parts = [[features(thin(part(r, p)), rig) for p in own]

@@ -178,7 +178,7 @@ class Change:
         return tuple(int(switch_probability(c, self.log_prior, self.making).argmax()) for c in self.contacts)
 
 
-def cut(change: Change) -> Change | None:
+def restricted(change: Change) -> Change | None:
     """Restrict a change to the samples among which it lies; None if there are none."""
     t = change.contacts[0].t
     recorded = np.any([np.isfinite(c.pressed) | np.isfinite(c.place) for c in change.contacts], axis=0)

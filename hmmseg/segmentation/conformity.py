@@ -34,13 +34,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.levels import MOVED, SETTLING
 from hmmseg.segmentation.boundaries import BoundaryPosterior
 from hmmseg.segmentation.emissions import Features, Parameters
-from hmmseg.segmentation.free_contacts import (
-    RINGING,
-    Block,
-    FreeContacts,
-    fit_free_contacts,
-    switching,
-)
+from hmmseg.segmentation.free_contacts import RINGING, Block, FreeContacts, fit_free_contacts, switching
 
 DEPARTURE = 1e-4  # prior: probability that a trial leaves its task at any one boundary
 STAGES = 3  # prior: most stages of the Erlang distribution of settling times
@@ -201,13 +195,13 @@ def examine(features: Sequence[Features], tasks: Sequence[BlockTask]) -> list[Co
     alone = [conformity(fit_free_contacts(f, sliding), steps) for f in features]
     fitting = [c for c in alone if c.failing is None]
     among_many = _consensus(fitting) if len(fitting) > MANY else None
-    found = []
+    out = []
     for f, c, task in zip(features, alone, tasks, strict=True):
-        known = among_many or _consensus([other for other in fitting if other is not c])
-        if known and (c.failing is not None or any(_differ(c.block(n), b) for n, b in known.items())):
-            c = conformity(c.free, steps, known)
-        found.append(_check_rises(f, c, steps, task))
-    return found
+        usual = among_many or _consensus([other for other in fitting if other is not c])
+        if usual and (c.failing is not None or any(_differ(c.block(n), b) for n, b in usual.items())):
+            c = conformity(c.free, steps, usual)
+        out.append(_check_rises(f, c, steps, task))
+    return out
 
 
 def _consensus(others: Sequence[Conformity]) -> dict[str, Block]:
@@ -260,12 +254,12 @@ def conformity(
     Tries the assignments of blocks to objects and takes the first that fits, otherwise the one of highest
     evidence. `known` blocks fix the assignment of their objects.
     """
-    ways, fixed, found = assignments(free, steps), dict[str, int | None](), []
-    for name, block in (known or {}).items():  # the nearest of the trial's that may be it, if any
+    fixed: dict[str, int | None] = {}
+    for name, block in (known or {}).items():  # the most similar block that may be it, if any
         alike = [i for i, own in enumerate(free.blocks) if own.like(block, BETWEEN_TRIALS)]
         fixed[name] = min(alike, key=lambda i: abs(free.blocks[i].width - block.width), default=None)
-    ways = [assignment | fixed for assignment in ways]
-    for assignment in ways:
+    tried = []
+    for assignment in (each | fixed for each in assignments(free, steps)):
         c = _compare(free, steps, assignment)
         while c.failing is not None and (lost := _lapses(c)):
             table, ringing, opened = c.free.table.copy(), c.free.ringing.copy(), c.free.opened.copy()
@@ -273,10 +267,10 @@ def conformity(
                 table[span], ringing[span], opened[span] = 0.0, 0.0, 0.0
             unread = replace(c.free, table=table, ringing=ringing, opened=opened)
             c = _compare(unread, steps, assignment)
-        found.append(c)
+        tried.append(c)
         if c.failing is None:
             return c
-    return max(found, key=lambda c: c.log_evidence)
+    return max(tried, key=lambda c: c.log_evidence)
 
 
 def _lapses(c: Conformity) -> list[slice]:
@@ -303,13 +297,11 @@ def assignments(free: FreeContacts, steps: Sequence[Subtask]) -> list[dict[str, 
     numbers, count = range(len(free.blocks)), len(names)
     if not numbers:
         return [dict.fromkeys(names)]
-    least = min(len(numbers), count)  # of fewer blocks some objects look alike, or are never touched
-    if len(numbers) < count:
-        every = itertools.product(numbers, repeat=count)
-    else:
-        every = itertools.permutations(numbers, count)
+    least = min(len(numbers), count)  # with fewer blocks some objects look alike, or are never touched
+    few = len(numbers) < count
+    others = itertools.product(numbers, repeat=count) if few else itertools.permutations(numbers, count)
     out: list[dict[str, int | None]] = []
-    for order in itertools.chain(_as_gripped(free, steps, names), every):
+    for order in itertools.chain(_as_gripped(free, steps, names), others):
         each: dict[str, int | None] = dict(zip(names, order, strict=True))
         if len(set(order)) == least and each not in out:
             out.append(each)
@@ -447,18 +439,18 @@ def _matching(runs: Sequence[Run], tail: Sequence[Subtask], c: Conformity) -> in
 
 
 def task_boundaries(
-    shown: Plan, found: Sequence[BoundaryPosterior], num_subtasks: int, first: float, last: float
+    shown: Plan, boundaries: Sequence[BoundaryPosterior], num_subtasks: int, first: float, last: float
 ) -> tuple[BoundaryPosterior, ...]:
     """Boundaries of the task, given those of the order shown.
 
     The failing subtask spans everything that belongs to no subtask; missing ones after it have zero length.
     """
-    every, length = [at(first), *found, at(last)], len(shown.steps)  # every[i] is where step i starts
+    starts, length = [point_mass(first), *boundaries, point_mass(last)], len(shown.steps)
     back = (min(num_subtasks - k, shown.num_after) for k in range(1, num_subtasks))
-    return tuple(every[k if k <= shown.num_before else length - b] for k, b in enumerate(back, 1))
+    return tuple(starts[k if k <= shown.num_before else length - b] for k, b in enumerate(back, 1))
 
 
-def at(t: float) -> BoundaryPosterior:
+def point_mass(t: float) -> BoundaryPosterior:
     """A boundary known to be at t [s]."""
     return BoundaryPosterior(np.array([t]), np.array([1.0]))
 

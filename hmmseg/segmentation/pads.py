@@ -41,8 +41,8 @@ from hmmseg.segmentation.stretches import (
     NONE,
     Stretch,
     Toe,
-    find,
-    fitted,
+    find_toe,
+    fit_slope,
     lagging,
     reading,
     ringing,
@@ -270,7 +270,7 @@ def read_again(s: Signals, sensing: Sensing) -> Signals:
             forces[name] = np.full_like(force, np.nan)
             forces[name][there], louder = _unfiltered(s.t[there], force[there], sensing.delay)
         else:
-            forces[name] = limited(s.t + sensing.delay, s.t[there], force[there])
+            forces[name] = resampled(s.t + sensing.delay, s.t[there], force[there])
     return replace(s, **forces, sd_force=s.sd_force * louder)
 
 
@@ -285,10 +285,10 @@ def _unfiltered(t: np.ndarray, force: np.ndarray, constant: float) -> tuple[np.n
     read = np.r_[force[:1], (force[1:] - kept * force[:-1]) / (1 - kept)]
     ago = np.r_[0.0, constant - step * kept / (1 - kept)]
     louder = float(np.median(np.sqrt(1 + kept**2) / (1 - kept)))
-    return limited(t, t - ago, read), louder
+    return resampled(t, t - ago, read), louder
 
 
-def limited(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+def resampled(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Readings (num_samples,) at t [s] evaluated `at` other times, NaN beyond the last.
 
     Each is extrapolated from its nearest neighbour with the lesser of the slopes on either side, if they
@@ -335,7 +335,7 @@ def sense(
     timing, toe = lateness(felt, priors[0]), NONE
     lead = 0.0 if timing.late else timing.delay
     if not again:  # corrected forces, or a wrist's, are too coarse for a toe
-        toe = find([(*reading(s, lead), s.sd) for s in grips])
+        toe = find_toe([(*reading(s, lead), s.sd) for s in grips])
         if toe is not NONE:  # a toe explains an apparent delay
             grips, lead = [replace(s, toe=toe) for s in grips], 0.0
             timing = timing if timing.late else Lateness()
@@ -404,7 +404,7 @@ def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tu
     Loads that ring, by at least `ringing` [N], while nothing moves flatten the line of places over loads, in
     the worst case to zero (`slope_between`).
     """
-    slope, weight = fitted(load, place, sd)
+    slope, weight = fit_slope(load, place, sd)
     if weight == 0:
         return slope, 0.0, 0.0
     x, y = load - load.mean(), place.mean() - place

@@ -14,7 +14,7 @@ from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import DRIFTS, SURE
 from hmmseg.robust import median_of_known
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind, evenly, normal
-from hmmseg.segmentation.changes import DISCREPANCY, Change, Penetration, Prior, cut, moment
+from hmmseg.segmentation.changes import DISCREPANCY, Change, Penetration, Prior, moment, restricted
 from hmmseg.segmentation.emissions import WINDOW, Features, Parameters, channel_sd
 from hmmseg.segmentation.pads import RIGID, Sensing
 from hmmseg.segmentation.spans import Span, spans_between
@@ -59,14 +59,14 @@ class Contacts:
             making = before.state == FREE
             fingers = tuple(self._finger(i, stretch, making) for i in (0, 1))
             slips = () if making else tuple(self._slip(i, stretch) for i in (0, 1))
-            return cut(Change(fingers, prior, making, "impact" if making else "smooth", timing, slips))
+            return restricted(Change(fingers, prior, making, "impact" if making else "smooth", timing, slips))
         if {before.state, after.state} == {ON_GROUND, ABOVE_GROUND}:
             making = after.state == ON_GROUND
             load = self._load(before, stretch, making)
             if self.signals.timing is not None:
                 nearest = self.signals.timing[stretch][:: 1 if making else -1][:2]
                 timing = float(np.hypot(timing, np.median(nearest)))
-            return cut(Change((load,), prior, making, "impact" if making else "launch", timing))
+            return restricted(Change((load,), prior, making, "impact" if making else "launch", timing))
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool) -> Penetration:
@@ -94,7 +94,7 @@ class Contacts:
         """The fingers below the height at which the pads' shear just carries the weight."""
         y = self.signals.y
         level = median_of_known(y[held] - self.deflection[held])
-        carrying = hanging(self.weight[str(before.object)], shown(self.sensing.pads))
+        carrying = hanging(self.weight[str(before.object)], visible(self.sensing.pads))
         sd_y = float(np.hypot(self.sd["y"], self.sensing.shear.doubt * carrying))
         return self._timely(Penetration(
             self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
@@ -121,10 +121,10 @@ class Contacts:
 
 def _compression(force: np.ndarray, sensing: Sensing) -> np.ndarray:
     """Compression [m] of one pad at each normal force [N]."""
-    return force * float(shown(sensing.pads).normal1) + sensing.normal.toe.give(2 * force) / 2
+    return force * float(visible(sensing.pads).normal1) + sensing.normal.toe.give(2 * force) / 2
 
 
-def shown(pads: Pads) -> Pads:
+def visible(pads: Pads) -> Pads:
     """Compliances of at least STIFFEST, so that the force of a rigid pad still shows as a compression."""
     return Pads(*(max(float(c), STIFFEST) for c in pads))
 
@@ -137,7 +137,7 @@ def contacts(signals: Signals, sensing: Sensing, parameters: Parameters) -> Cont
     sd_x, sd_y = channel_sd(s.sd_x, s.x1), channel_sd(s.sd_y, s.y1)
     rates, sinking, sd_vx, sd_vy = _rates(s, inward, sd_x, sd_y)
     force = parameters.force_sd(s)
-    pads, toe = shown(sensing.pads), sensing.normal.toe
+    pads, toe = visible(sensing.pads), sensing.normal.toe
     fy1, fy2 = s.fy1 - bias[1], s.fy2 - bias[3]
     level = parameters.scale["level"]
     return Contacts(

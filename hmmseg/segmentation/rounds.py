@@ -82,7 +82,7 @@ def round_tasks(task: BlockTask, number: int) -> list[BlockTask]:
     return out
 
 
-def cut(f: Features, task: BlockTask) -> list[float]:
+def find_cuts(f: Features, task: BlockTask) -> list[float]:
     """Times [s] within the free motions between the rounds of one recording, in order; none for one round.
 
     `f` needs no more than emissions' MAX_RATE.

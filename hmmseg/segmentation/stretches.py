@@ -68,7 +68,7 @@ class Toe:
 NONE = Toe()
 
 
-def find(readings: Sequence[Reading]) -> Toe:
+def find_toe(readings: Sequence[Reading]) -> Toe:
     """The toe common to all stretches, or NONE.
 
     Loads are those of the contact itself, 0 where it ends.
@@ -229,7 +229,7 @@ def reading(s: Stretch, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     return load[within], s.place[within] + s.toe.give(load[within])
 
 
-def fitted(load: np.ndarray, value: np.ndarray, sd: float) -> tuple[float, float]:
+def fit_slope(load: np.ndarray, value: np.ndarray, sd: float) -> tuple[float, float]:
     """Slope -dvalue/dload of samples (N,) and its information; Student-t, reweighted.
 
     Noise of the loads, bounded by the residual of the values, would flatten the slope by its share of their

@@ -67,9 +67,7 @@ def threshold(values: np.ndarray, level: float) -> np.ndarray:
 
 
 def label_states(
-    signals: Signals,
-    force_threshold: float = FORCE_THRESHOLD,
-    velocity_threshold: float = VELOCITY_THRESHOLD,
+    signals: Signals, force_threshold: float = FORCE_THRESHOLD, velocity_threshold: float = VELOCITY_THRESHOLD
 ) -> StateLabels:
     """Contact state of every sample by the rules of the paper's Table 2.
 

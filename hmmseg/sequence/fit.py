@@ -148,16 +148,13 @@ def choose_detectors(taught: Learner, data: Sequence[SequenceFeatures], boundari
                      paths: Sequence[np.ndarray], temper: float, law: Chain) -> Detectors:  # fmt: skip
     """Detectors whose window and weights place held-out labels best (leave-one-trial-out).
 
-    The score is the log probability within a cell of the label, which penalises overconfident weights. With
-    a single labelled trial: the middle window, weighted by the emissions' share of independent observations.
+    The score is the log probability within a cell of the label, which penalises overconfident weights.
     """
     channels = [v[:, : v.shape[1] // 2] for v in taught.values]
     cells = [np.searchsorted(d.middle, b, side="right") - 1 for d, b in zip(data, boundaries, strict=True)]
     shown = [_shown(each) for each in cells]
     length = float(np.median([len(v) for v in taught.values]))
     halves = sorted({max(round(share * length), 2) for share in HALVES})
-    if len(data) == 1:
-        return replace(learn(channels, shown, halves[len(halves) // 2]), weight=temper)
     onehot = [np.eye(law.num_states)[path] for path in paths]
     rests = [[j for j in range(len(data)) if j != i] for i in range(len(data))]
     lls = []

@@ -253,25 +253,26 @@ def _model_of(table: dict[str, np.ndarray], task: SequenceTask, where: str) -> S
     def take(key: str, *shape: int) -> np.ndarray:
         array = table[key]
         if array.shape != shape or not np.isfinite(array).all():
-            raise InputError(where, f"{key} has shape {array.shape}", f"finite numbers of shape {shape}")
+            problem = "is not finite" if array.shape == shape else f"has shape {array.shape}"
+            raise InputError(where, f"{key} {problem}", f"finite numbers of shape {shape}")
         return array
 
     def emissions(prefix: str, count: int) -> StudentEmissions:
         loc, spread = (take(f"{prefix}{key}", count, num_features) for key in ("loc", "spread"))
-        return StudentEmissions(loc, spread, float(table[f"{prefix}temper"]))
+        return StudentEmissions(loc, spread, float(take(f"{prefix}temper")))
 
     settled = bool(table["settled"])
     num_states, num_features = len(task.sequence) + settled, 2 * len(channels)
     boundaries, detectors, courses = len(task.sequence) - 1, None, []
     if any(name.startswith("detectors.") for name in table):
-        half = int(table["detectors.half"])
+        half = int(take("detectors.half"))
         windows = boundaries, 2 * half, len(channels)
         detectors = Detectors(
             half, take("detectors.mean", *windows), take("detectors.spread", *windows),
             take("detectors.usual", len(channels)), take("detectors.jitter", boundaries),
-            float(table["detectors.weight"]), float(table["detectors.state_weight"]),
+            float(take("detectors.weight")), float(take("detectors.state_weight")),
         )  # fmt: skip
-    for i in range(int(table["courses"])):
+    for i in range(int(take("courses"))):
         prefix, count = f"courses.{i}.", len(table[f"courses.{i}.mean_cells"])
         probability = float(take(f"{prefix}probability"))
         if not 0 <= probability <= 1:
@@ -279,7 +280,7 @@ def _model_of(table: dict[str, np.ndarray], task: SequenceTask, where: str) -> S
         of_changes = (take(f"{prefix}{key}", boundaries, count - 1) for key in ("naming", "shift"))
         cells = take(f"{prefix}mean_cells", count)
         courses.append(NamedCourse(probability, emissions(prefix, count), cells, *of_changes))
-    mapping = FeatureMap(channels, float(table["step"]), int(table["window"]), take("center", num_features),
+    mapping = FeatureMap(channels, float(take("step")), int(take("window")), take("center", num_features),
                          take("scale", num_features))  # fmt: skip
     of_states = {key: take(key, num_states) for key in ("mean_cells", "presence", "typical")}
     of_boundaries = {key: take(key, boundaries) if courses else table[key] for key in ("lag", "sure")}

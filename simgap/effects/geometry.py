@@ -126,32 +126,32 @@ HUSH = 3.0  # chosen: sds of an angle that it must turn by before its joint coun
 ANYWHERE = 4 / 3  # physics: mean square distance from a side of a band to anywhere in it, in half its width
 
 
-def _noise_backlash(values: np.ndarray) -> np.ndarray:
+def _noise(values: np.ndarray) -> np.ndarray:
     """Noise (T, 4) of sampled signals (T, N, 4), from their second differences."""
     bend = np.abs(values[:, 2:] - 2 * values[:, 1:-1] + values[:, :-2])
     return np.maximum(np.median(bend, axis=1) / (0.6745 * np.sqrt(6)), 1e-6)
 
 
-def _moves_backlash(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moves(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Direction (T, N, 4) of motion of each recorded angle, -1, 1, or 0 at rest, and the angle without its
     noise, constant at rest."""
     from simgap.recursions import play
 
-    hush = HUSH * _noise_backlash(joints)
+    hush = HUSH * _noise(joints)
     calm = np.empty_like(joints)
     for trial, joint in np.ndindex(hush.shape):
         calm[trial, :, joint] = play(joints[trial, :, joint], 2 * hush[trial, joint])
     return np.sign(np.diff(calm, axis=1, prepend=joints[:, :1])), calm
 
 
-def _nearest_backlash(moves: np.ndarray, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_move(moves: np.ndarray, reverse: bool) -> tuple[np.ndarray, np.ndarray]:
     """The last move before each sample (in reverse: the next one), 0 if there is none, and its distance in
     samples.
 
     A sample's own move does not count, as its noise would choose its own side.
     """
     if reverse:
-        move, ago = _nearest_backlash(moves[:, ::-1], False)
+        move, ago = _nearest_move(moves[:, ::-1], False)
         return move[:, ::-1], ago[:, ::-1]
     here = np.arange(moves.shape[1])[:, None]
     last = np.maximum.accumulate(np.where(moves != 0, here, -1), axis=1)
@@ -168,9 +168,9 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     sample to the next it may have gone anywhere in the band. A band too narrow for motion to be detected has
     no effect.
     """
-    band = half * np.clip(2 * half / (HUSH * _noise_backlash(world.joints)[:, None]) - 1, 0.0, 1.0)
-    moves, calm = _moves_backlash(world.joints)
-    (last, ago), (following, ahead) = _nearest_backlash(moves, False), _nearest_backlash(moves, True)
+    band = half * np.clip(2 * half / (HUSH * _noise(world.joints)[:, None]) - 1, 0.0, 1.0)
+    moves, calm = _moves(world.joints)
+    (last, ago), (following, ahead) = _nearest_move(moves, False), _nearest_move(moves, True)
     rest = ago + ahead - 1
     share = (ago - 0.5) / rest
     share = np.where(last == 0, 1.0, np.where(following == 0, 0.0, share))
@@ -191,13 +191,13 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     free = (moves == 0) | (last != following)
     path = side + (1 - unseen) * np.where(free, own - before * (1 - share) - after * share, 0.0)
     place = np.clip(path, -band, band)
-    seen = np.square(_noise_backlash(world.rates)[:, None] * np.median(step))
+    seen = np.square(_noise(world.rates)[:, None] * np.median(step))
     # Changes within the noise pin nothing.
     went_on = np.abs(np.diff(calm, axis=1))
     far = np.pad(went_on, ((0, 0), (1, 0), (0, 0))) + np.pad(went_on, ((0, 0), (0, 1), (0, 0)))
     return DeadBand(
         place,
-        (last == following) & (rest == 1) & (far > HUSH * _noise_backlash(world.joints)[:, None]),
+        (last == following) & (rest == 1) & (far > HUSH * _noise(world.joints)[:, None]),
         (1 - unseen) * np.diff(own, axis=1, prepend=own[:, :1]),
         np.broadcast_to((1 - unseen) * seen, place.shape),
         np.square(unseen * band[:, 0]) * ANYWHERE,

@@ -285,13 +285,13 @@ JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
 def _scatter_clock_jitter(given, residual: np.ndarray):
     from simgap.gap.assemble import on_grid, rows_of
 
-    rows, rate = rows_of(given), _rates_clock_jitter(given)[given.there]
+    rows, rate = rows_of(given), _clock_rates(given)[given.there]
     size = np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1)
     part = rows.trial * len(rows.parts) + rows.part
     return on_grid("clock_jitter", residual**2, size[rows.cell], JITTERS, part)
 
 
-def _rates_clock_jitter(given) -> np.ndarray:
+def _clock_rates(given) -> np.ndarray:
     """Whitened change per second of clock error (T, N, C), from fast motion alone."""
     world = given.frame.world
     _, velocity = tips(world)

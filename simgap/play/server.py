@@ -143,7 +143,7 @@ class PlayServer:
             else:
                 raise ValueError(kind)
         except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
-            return {"kind": "said", "text": "a message that says nothing"}
+            return {"kind": "said", "text": "unreadable message"}
         return None
 
     async def _change(self, name: str | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Candidate effects on robots: of their commands, of their read-outs, and parameters of the simulator."""
+"""Candidate effects on robots: on commands, on read-outs, and on the simulator's parameters."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ FAMILIES = (commands, readouts)
 
 
 def candidates(setting: Setting) -> dict[str, RobotEffect]:
-    """Every candidate for this simulator and these recordings, by name: what commands, the simulator's own
-    parameters and read-outs may have wrong."""
+    """All candidates for a simulator and recordings, by name."""
     made = [*commands.candidates(setting), *of_the_model(setting), *readouts.candidates(setting)]
     return {effect.name: effect for effect in made}
 
 
 def of_the_model(setting: Setting) -> list[RobotEffect]:
-    """One for each effect that the simulator's parameters name; a parameter without one is its own. The
-    solver's own numbers are fitted along: no robot has a step."""
+    """One effect for each that the simulator's parameters name; a parameter that names none is its own.
+
+    The solver's own numbers are fitted along: no robot has a step.
+    """
     groups: dict[str, dict[str, str]] = {}
     known, numerics = setting.simulator.parameters, {*getattr(setting.simulator, "numerics", ())}
     dear = {*getattr(setting.simulator, "dear", numerics)}
@@ -53,11 +54,11 @@ def of_the_model(setting: Setting) -> list[RobotEffect]:
     ]
 
 
-# prior: what a model states and nobody measured may be off by so many usual sizes of what it has wrong
+# prior: usual sizes by which what a model states and nobody measured may be off
 WIDE = 30.0
-# prior: by unit, factors on what a model states that no robot is off by: beyond is no value at all
+# prior: by unit, the largest factor by which a stated value may be off
 MOST = {"kg": 3.0, "kg m^2": 10.0}
-# What models state and nobody measured, and what they lack, which is fitted where the former leaves a gap.
+# What models state and nobody measured; and what they lack, fitted where the former leaves a gap.
 STATED = (
     "joint:*.damping", "joint:*.frictionloss", "joint:*.armature", "actuator:*.gain", "actuator:*.damping",
     "geom:*.stiffness", "command.delay",
@@ -72,11 +73,16 @@ def effects_of(
     more: Iterable[RobotEffect] = (),
     uncertain: Sequence[str] = (),
 ) -> dict[str, RobotEffect]:
-    """Every effect of a simulator along logs, `more` among them, with what the simulator and patterns say of
-    how sure each is.
+    """All effects of a simulator along logs.
+
+    Args:
+        simulator: The robot's model.
+        recordings: Its logs.
+        more: Further candidates.
+        uncertain: Patterns of further effects that were never measured, and so are fitted along.
 
     Raises:
-        InputError: the simulator's map names none.
+        InputError: The simulator's map names an effect that there is none of.
     """
     known = candidates(Setting(simulator, recordings)) | {e.name: e for e in more}
     sds, named = getattr(simulator, "sd", {}), getattr(simulator, "uncertain", ())
@@ -89,7 +95,7 @@ def effects_of(
 
 
 def _plausible(effect: RobotEffect) -> RobotEffect:
-    """The effect with masses and inertias that are stated kept within what a robot can have."""
+    """The effect with stated masses and inertias bounded to what a robot can have."""
     bounded = {}
     for name, p in effect.parameters.items():
         if p.nominal > 0 and p.unit in MOST:
@@ -101,8 +107,14 @@ def _plausible(effect: RobotEffect) -> RobotEffect:
 def doubted(
     effects: Mapping[str, RobotEffect], uncertain: Iterable[str], sds: Mapping[str, float]
 ) -> dict[str, RobotEffect]:
-    """The effects, with standard deviations of parameters as somebody states them (`sds`, by effect); those
-    that match patterns of what is `uncertain` are fitted along, widely where nobody states how."""
+    """The effects with their uncertainty as stated.
+
+    Args:
+        effects: By name.
+        uncertain: Patterns of those that were never measured: they are fitted along, with wide priors where
+            `sds` has none.
+        sds: Standard deviations by effect.
+    """
     patterns, out = tuple(uncertain), dict(effects)
     for name, effect in effects.items():
         if any(fnmatchcase(name, p) for p in patterns) and not effect.fitted:
@@ -121,8 +133,7 @@ def _sized(effect: RobotEffect, factor: float, sd: float | None) -> dict[str, Pa
 
 
 def words(name: str) -> tuple[str, str] | None:
-    """A candidate in plain words, of a channel or a body by its name, and what to check on the robot; None of
-    a model's own parameter."""
+    """A candidate in plain words and what to check on the robot; None of a model's own parameter."""
     kind, where = re.sub(r":.*\.", ".", name), re.search(r":(.*)\.", name)
     for module in FAMILIES:
         if kind in module.WORDS:

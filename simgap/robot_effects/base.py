@@ -1,4 +1,4 @@
-"""What an effect on a robot is: composed around a simulator, never inside of it.
+"""Effects on a robot, composed around a simulator and never inside of it.
 
 An effect acts on what is read (`alter`), on what is commanded (`command`), or on parameters that the
 simulator itself offers (`model`).
@@ -25,15 +25,15 @@ Alter = Callable[[Recording, Channels, Theta], Channels]  # (window, channels as
 
 @dataclass(frozen=True)
 class RobotEffect(Effect):
-    """One candidate. `parameters` by short name, neutral at their nominal; it alters, commands or models.
+    """One candidate; its `parameters` by short name are neutral at their nominal values.
 
-    `alter` gives those channels of a window that are not read as they are, `restore` undoes it on a whole
-    log, from which starts are read then. `command` maps a whole recording to one whose commands are as the
-    drives took them. `model` maps short names to the simulator's parameters. What is `fitted` is fitted along
-    with every cause and is none itself; `widened`: how many usual sizes its parameters' sd are, where that is
-    of what a model states and nobody measured; `by_log`: each log has its own parameters, which no other log
-    tells; `numeric`: it is of the simulator's own numerics (its step, how it holds commands), `dear` where
-    that costs another run of every window.
+    `alter` returns the channels of a window that are read differently; `restore` undoes that on a whole log,
+    from which starts are then read; `command` maps a recording to one with commands as the drives carried
+    them out; `model` maps short names to the simulator's parameters. What is `fitted` is fitted along with
+    every cause and is none itself; `widened`: how many usual sizes the sd of its parameters is, where a model
+    states them and nobody measured; `by_log`: each log has parameters of its own; `numeric`: it is of the
+    simulator's own numerics (its step, how it holds commands), and `dear` where that costs another run of
+    every window.
     """
 
     alter: Alter | None = None
@@ -47,12 +47,12 @@ class RobotEffect(Effect):
     dear: bool = False
 
     def label(self, short: str) -> str:
-        """A parameter's name: the effect's, and its own where that has several."""
+        """A parameter's name: the effect's, followed by its own where there are several."""
         return self.name if len(self.parameters) == 1 else f"{self.name}.{short}"
 
 
 def entry(parameter: Parameter, mean: float, sd: float) -> dict[str, Any]:
-    """What a document says of a parameter's posterior, the interval within bounds."""
+    """A parameter's posterior in the document, its interval within bounds."""
     low, high = max(mean - NORMAL_90 * sd, parameter.low), min(mean + NORMAL_90 * sd, parameter.high)
     return {
         "nominal": parameter.nominal, "mean": mean, "sd": sd, "interval_90": [low, high],
@@ -62,31 +62,31 @@ def entry(parameter: Parameter, mean: float, sd: float) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Setting:
-    """What the candidates are made for: the simulator and the recordings."""
+    """What candidates are made for: the simulator and the recordings."""
 
     simulator: Simulator
     recordings: Sequence[Recording]
 
     def compared(self, *kinds: str) -> list[str]:
-        """Channels of these kinds that are compared (any but commands by default)."""
+        """Compared channels of these kinds; of all kinds but commands by default."""
         known = self.simulator.channels
         return [n for n, c in known.items() if (c.kind in kinds if kinds else c.kind != "command")]
 
     def commands(self) -> list[str]:
-        """Channels that are commanded."""
+        """Command channels."""
         return self.compared("command")
 
     def poses(self) -> Mapping[str, Mapping[str, str]]:
-        """Bodies whose whole pose is read: x, y, z, qw, qx, qy, qz to its column."""
+        """Columns of bodies whose whole pose is read, by x, y, z, qw, qx, qy, qz."""
         return getattr(self.simulator, "poses", {})
 
     def alone(self) -> list[str]:
-        """Compared channels that are read by themselves; a quaternion's components are not."""
+        """Compared channels but components of a quaternion."""
         turns = {c for columns in self.poses().values() for axis, c in columns.items() if axis[0] == "q"}
         return [n for n in self.compared() if n not in turns]
 
     def late_alone(self) -> list[str]:
-        """Those that can be late by themselves: no component of a pose can."""
+        """Compared channels but components of a pose, which are late together."""
         posed = {c for columns in self.poses().values() for c in columns.values()}
         return [n for n in self.compared() if n not in posed]
 

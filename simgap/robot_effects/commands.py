@@ -1,6 +1,6 @@
-"""Effects on robots' commands: those of a channel, a delay of all together, and a supply that sags.
+"""Effects on commands: those of a channel, a delay of all together, and a sagging supply.
 
-Each maps a whole recording to one whose commands are as the drives took them.
+Each maps a recording to one with commands as the drives carried them out.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect, Setting
 from simgap.simulators.recording import Recording
 
-TICK = 1e-9  # numerics: s: times that are equal but for rounding
+TICK = 1e-9  # numerics: s: rounding of equal times
 
 KINDS = ("effort", "duty", "place")  # of commands
 WORDS = {
@@ -28,8 +28,8 @@ WORDS = {
 
 
 def candidates(setting: Setting) -> Iterator[RobotEffect]:
-    """One of each kind for every command that it can be of; a delay is of all commands together, and a sag
-    of every command in V that varies."""
+    """One of each kind for every command that it applies to; a delay of all commands together, and a sag for
+    every command in V that varies."""
     known, every = setting.simulator.channels, drives(setting)
     of = {"effort": [n for n in every if known[n].unit != "1"],
           "duty": [n for n in every if known[n].unit == "1"], "place": places(setting)}  # fmt: skip
@@ -66,8 +66,8 @@ def _late(names: list[str]):
 
 
 def _late_by_time(names: list[str], acts: str):
-    """Of a simulator that is told when each row's commands are carried out: the very ones, as much later,
-    and with each row those that follow."""
+    """For a simulator that takes the times at which each row's commands are carried out: the same commands,
+    later, and with each row those that follow."""
 
     def late(recording: Recording, theta: Theta) -> Recording:
         delay, given = theta["delay"], recording.columns.get(acts, recording.t)
@@ -103,7 +103,7 @@ def _sags(setting: Setting, efforts: list[str]) -> Iterator[RobotEffect]:
 
 
 def drives(setting: Setting) -> list[str]:
-    """Commands of torque, force, current or duty: those that are 0 where nothing is to be done."""
+    """Commands of torque, force, current or duty: zero where nothing is to be done."""
     known = setting.simulator.channels
     efforts = {n for n in setting.commands() if known[n].unit in ("N m", "N", "A", "Nm")}
     switches = {n for n in setting.commands() if known[n].unit == "1" and _switches(setting, n)}
@@ -116,5 +116,5 @@ def places(setting: Setting) -> list[str]:
 
 
 def _switches(setting: Setting, name: str) -> bool:
-    """Whether a command has two values at most: a switch, not a drive."""
+    """Whether a command has two values at most, as a switch has."""
     return all(np.unique(r[name][np.isfinite(r[name])]).size <= 2 for r in setting.recordings)

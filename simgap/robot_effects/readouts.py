@@ -1,11 +1,11 @@
-"""What sensors make of the truth: a bias, a drift, a gain, a lag, a low-pass, a scale of all lengths, and a
-pose that is late, turned or offset as a whole; and what every log has of its own.
+"""Effects on read-outs: bias, drift, gain, lag and low-pass of a channel, a scale of all lengths, and a pose
+that is late, rotated or offset as a whole; and what differs between logs.
 
 A body's seven columns (place and unit quaternion, scalar first) come from one camera or tracker, so they are
-late, turned or offset together. What each log has of its own is fitted along with every cause: when it was
-started, where a marker sat. A simulator says so by `by_log`: `shift` (s, the log's clock against the
-simulator's) and `offset` (m, of the point that is read against the body's origin, in the body's frame), each
-a Parameter.
+late, rotated or offset together. What differs between logs is fitted along with every cause: when a log was
+started, where a marker sat. A simulator declares it by `by_log`: `shift` [s], the log's clock against the
+simulator's, and `offset` [m], of the point that is read from the body's origin, in the body's frame, each a
+Parameter.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ WORDS = {
 
 
 def candidates(setting: Setting) -> Iterator[RobotEffect]:
-    """What logs have of their own; one of each kind for every channel that is read by itself; a scale where
-    several lengths are read; and of each body's pose."""
+    """What differs between logs; one of each kind for every channel that is read by itself; a scale where
+    several lengths are read; and those of each body's pose."""
     yield from by_log(setting)
     for effect in channel_effects().values():
         for name in setting.late_alone() if effect.remembers else setting.alone():
@@ -63,7 +63,7 @@ def candidates(setting: Setting) -> Iterator[RobotEffect]:
 
 
 def of_channel(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffect:
-    """An effect on what is read of one channel."""
+    """An effect on the read-out of one channel."""
     begun = {r.name: float(r.t[0]) for r in setting.recordings}
 
     def acting(act: Act, log: Recording, values: np.ndarray, theta: Theta) -> dict[str, np.ndarray]:
@@ -84,7 +84,7 @@ Turn = Callable[[np.ndarray, Channels, Theta, float], Channels]  # (times, colum
 
 
 def _of_columns(name: str, says: str, parameters: Mapping[str, Parameter], act: Turn) -> RobotEffect:
-    """An effect on several columns at once, there and back."""
+    """An effect on several columns at once, with its inverse."""
     return RobotEffect(
         name,
         says,
@@ -95,7 +95,7 @@ def _of_columns(name: str, says: str, parameters: Mapping[str, Parameter], act: 
 
 
 def of_pose(body: str, columns: Mapping[str, str]) -> Iterator[RobotEffect]:
-    """What may be wrong with a body's pose as a whole."""
+    """Effects on a body's pose as a whole."""
     place, turn = [columns[a] for a in PLACE], [columns[a] for a in TURN]
 
     def late(t: np.ndarray, known: Channels, theta: Theta, way: float) -> Channels:
@@ -122,13 +122,13 @@ def of_pose(body: str, columns: Mapping[str, str]) -> Iterator[RobotEffect]:
 
 
 def _shifted(columns: Channels, place: Sequence[str], turn: Sequence[str], arm: np.ndarray) -> Channels:
-    """Places of a point at an offset (3,) in the body's frame from that of `columns`."""
+    """Places of a point offset by `arm` (3,) in the body's frame from that of `columns`."""
     moved = rotated(np.array([columns[n] for n in turn]), arm)
     return {n: columns[n] + d for n, d in zip(place, moved, strict=True)}
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Hamilton's product (4, n) of quaternions, scalar first."""
+    """The Hamilton product (4, n) of quaternions, scalar first."""
     w, x, y, z = a
     p, q, r, s = b
     return np.array(
@@ -142,14 +142,14 @@ def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def rotated(turn: np.ndarray, arm: np.ndarray) -> np.ndarray:
-    """A fixed arm (3,) in the body's frame, in the world's (3, n), by unit quaternions (4, n)."""
+    """A fixed arm (3,) in the body's frame, rotated to the world's (3, n) by unit quaternions (4, n)."""
     w, axis = turn[0], turn[1:]
     once = np.cross(axis, arm[:, None], axis=0)
     return arm[:, None] + 2 * (w * once + np.cross(axis, once, axis=0))
 
 
 def by_log(setting: Setting) -> Iterator[RobotEffect]:
-    """One for the shift, one for each pose's offset; none is a cause."""
+    """The shift of each log, and the offset of each pose; none is a cause."""
     known: Mapping[str, Parameter] = getattr(setting.simulator, "by_log", {})
     logs, every = [r.name for r in setting.recordings], setting.compared()
 

@@ -1,10 +1,9 @@
-"""What nobody measured of a robot's model, fitted to its logs: all of it together, by whole logs run freely.
+"""Calibration: what nobody measured of a robot's model, all of it fitted together to its logs, run freely.
 
-Windows that are begun anew lead near, from wherever a data sheet starts; logs run from their first state to
-their last, as people judge a model, settle it. Squares are of each channel in units of what is left of it, by
-Levenberg and Marquardt within bounds. What a model states is moved first; where that leaves a gap, so is what
-it lacks: friction by load, drives that fade. Which parameters the logs tell, and which only together, is read
-off the sensitivities there.
+Restarted windows lead near from wherever a data sheet starts; logs run from first to last state, as people
+judge a model, settle it. Least squares within bounds, each channel in units of its own residual. What a model
+states is fitted first; where that leaves a gap, so is what it lacks: friction by load, drives that fade.
+Which parameters the logs determine, alone or jointly, is read off the sensitivities there.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects import LACKING
 from simgap.robot_effects.base import NORMAL_90, RobotEffect, entry
-from simgap.robots.fit import FINEST, Whiten, moved_to
+from simgap.robots.fit import FINEST, Whiten, fit_effects
 from simgap.robots.linear import STEP, Linear, base_at, linearise, vary
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import folds_of, noises
@@ -29,23 +28,24 @@ from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-STAGES = 4  # look: what a progress bar counts
-LONGEST = 20.0  # numerics: s that a log is run freely
-STEPS, AGAIN = 30, 4  # numerics: of the fit, and of one that begins where it ended
-ROUNDS = 2  # numerics: fits, each in units of what the last one left
+STAGES = 4  # look: stages that a progress bar counts
+LONGEST = 20.0  # numerics: s that a log is run freely at most
+STEPS, AGAIN = 30, 4  # numerics: steps of a fit, and of one that begins where another ended
+ROUNDS = 2  # numerics: fits, each in units of the residual of the last one
 LEAVES = 4.0  # numerics: squares over the noise's, from which laws that a model lacks are fitted too
-UNTOLD = 0.5  # chosen: of a prior's sd; a parameter of which logs leave more is not told by them
-NOTHING = 0.05  # numerics: a correlation that is none
-COUPLED = 0.05  # numerics: of a direction that is not told, what a parameter must have in it to be of it
+UNTOLD = 0.5  # chosen: share of the prior's sd; a parameter with more left is not determined by the logs
+NOTHING = 0.05  # numerics: a correlation up to which there is none
+COUPLED = 0.05  # numerics: weight in an undetermined direction from which a parameter belongs to it
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The `point` of the best fit; of its parameters, in the order of `names`, the `covariance` (p, p), the
-    priors' `sd` (p,), and in these units the logs' `information` (p, p).
+    """The best fit of p parameters.
 
-    `before` and `after`: root mean squares by channel of free runs along logs that took no part. `composed`
-    has whole logs.
+    `composed`: the model along whole logs; `point`: the best fit; `names`: effect and parameter, in the order
+    of what follows; `sd`: the priors' standard deviations (p,); `covariance`: of the fit (p, p);
+    `information`: of the logs (p, p), in units of `sd`; `before`, `after`: root mean squares by channel of
+    free runs along held-out logs, nominal and fitted.
     """
 
     composed: Composed
@@ -58,20 +58,21 @@ class Calibration:
     after: Mapping[str, float]
 
     @property
-    def told(self) -> np.ndarray:
-        """Whether logs determine each parameter by itself (p,)."""
+    def determined(self) -> np.ndarray:
+        """Whether the logs determine each parameter by itself (p,)."""
         return np.sqrt(np.diag(self._posterior)) <= UNTOLD
 
     @property
     def _posterior(self) -> np.ndarray:
-        """The covariance by information and prior alone, in units of the priors' sd."""
+        """The covariance (p, p) from the logs' information and the priors, in units of `sd`."""
         return np.linalg.inv(self.information + np.eye(self.sd.size))
 
     def body(self) -> dict[str, Any]:
-        """The document: parameters, what is told only together, the simulation's numbers, held-out logs."""
+        """The JSON document: parameters, jointly determined combinations, the simulation's own numbers,
+        held-out logs."""
         every = range(len(self.names))
         own = [k for k in every if not self.composed.effects[self.names[k][0]].numeric]
-        untold = [k for k in own if not self.told[k]]
+        untold = [k for k in own if not self.determined[k]]
         return {
             "parameters": {self.label(k): self.entry(k) | (_UNKNOWN if k in untold else {}) for k in own},
             "reasons": {self.label(k): self._reason(k) for k in untold},
@@ -81,17 +82,17 @@ class Calibration:
         }
 
     def label(self, k: int) -> str:
-        """A parameter's name."""
+        """A parameter's name in the document."""
         effect, short = self.names[k]
         return self.composed.effects[effect].label(short)
 
     def value(self, k: int) -> float:
-        """A parameter where the fit ended."""
+        """A parameter at the best fit."""
         effect, short = self.names[k]
         return float(self.point[effect][short])
 
     def entry(self, k: int) -> dict[str, Any]:
-        """A parameter in the document."""
+        """A parameter's entry in the document."""
         effect, short = self.names[k]
         known = self.composed.effects[effect].parameters[short]
         return entry(known, self.value(k), float(np.sqrt(self.covariance[k, k])))
@@ -103,7 +104,7 @@ class Calibration:
         return f"told only together with {', '.join(others)}"
 
     def _group(self, k: int) -> list[int]:
-        """What shares with a parameter a direction that is not told."""
+        """Parameters that share an undetermined direction with a parameter, itself included."""
         value, vector = np.linalg.eigh(self._posterior)
         vague = vector[:, np.sqrt(value) > UNTOLD]
         seen = (np.diag(self.information) >= 1) & (np.sum(vague**2, 1) > COUPLED)
@@ -117,14 +118,15 @@ class Calibration:
         return sorted(found)
 
     def combinations(self) -> list[dict[str, Any]]:
-        """What is told of parameters that are only told together: sums, each with a pivot of its own."""
-        left, out = [int(k) for k in np.flatnonzero(~self.told & (np.diag(self.information) >= 1))], []
+        """Weighted sums that the logs determine of jointly determined parameters, each with a pivot of its
+        own."""
+        left, out = [int(k) for k in np.flatnonzero(~self.determined & (np.diag(self.information) >= 1))], []
         while left:
             group = np.array(self._group(left[0]))
             left = [k for k in left if k not in group]
             value, vector = np.linalg.eigh(self._posterior[np.ix_(group, group)])
             rows = vector[:, np.sqrt(value) <= UNTOLD].T / self.sd[group]
-            for row in _reduced(rows, self.sd[group]):
+            for row in _echelon(rows, self.sd[group]):
                 whole = np.zeros(len(self.names))
                 whole[group] = row
                 mean = sum(c * self.value(k) for k, c in enumerate(whole) if c)
@@ -140,9 +142,11 @@ class Calibration:
 _UNKNOWN = {"mean": None, "sd": None, "interval_90": None}
 
 
-def _reduced(rows: np.ndarray, size: np.ndarray) -> list[np.ndarray]:
-    """Rows (k, g) in reduced echelon form, so that each has a pivot 1 that no other has; entries that move
-    nothing, at parameters' sizes (g,), are 0."""
+def _echelon(rows: np.ndarray, size: np.ndarray) -> list[np.ndarray]:
+    """Rows (k, g) in reduced echelon form: each has a pivot 1 in a column where the others have 0.
+
+    Entries that matter little at the parameters' sizes (g,) become 0.
+    """
     out, free = rows.copy(), list(range(rows.shape[1]))
     for k in range(len(out)):
         pivot = max(free, key=lambda j, k=k: abs(out[k, j]) * size[j])
@@ -168,16 +172,16 @@ def calibrate(
     """Fit all effects that are `fitted` to logs of a robot.
 
     Args:
-        simulator: the robot's model.
-        recordings: its logs; with one or two, stretches of them are held out.
-        effects: by name; those that are not fitted along are left out.
-        length: s of windows that lead near.
-        begin: where to begin, if that is near already; effects in it that are not fitted along stay there.
-        tell: called with a description of each stage.
-        judged: whether it is fitted anew without each log in turn, to say how far that is from it.
+        simulator: The robot's model.
+        recordings: Its logs; the halves of a single one are held out.
+        effects: By name; those that are not fitted along are left out.
+        length: Length of the windows that lead near [s].
+        begin: Where to begin, if that is near already; effects in it that are not fitted along stay there.
+        tell: Called with a description of each stage.
+        judged: Whether the fit is repeated without each log in turn, to tell how far it is from that log.
 
     Raises:
-        InputError: nothing is uncertain, or the simulator diverges.
+        InputError: Nothing is uncertain, or the simulator diverges.
     """
     mine = {n: e for n, e in effects.items() if e.fitted or n in (begin or {})}
     fitted = [n for n, e in mine.items() if e.fitted]
@@ -192,25 +196,25 @@ def calibrate(
     if begin is None:
         linear = linearise(windows, point, [])
         whiten = covariances(windows, linear).whitener()
-        near, steps = moved_to(windows, linear, whiten, point, stated, STEPS), STEPS
+        near, steps = fit_effects(windows, linear, whiten, point, stated, STEPS), STEPS
     tell("whole logs")
     whole = Composed.of(simulator, _stretches(recordings), mine, noise, LONGEST)
     start = min((near, point), key=lambda p: _cost(whole, p))
-    if not np.isfinite(_cost(whole, start)):  # nothing follows a whole log freely: windows are all there is
+    if not np.isfinite(_cost(whole, start)):  # no free run follows a whole log: only windows are left
         whole, start = windows, near
     found, linear, whiten = _least_squares(whole.moved(start), start, steps, stated)
     if _over_noise(linear) > LEAVES and len(stated) < len(fitted):
         found, linear, whiten = _least_squares(whole.moved(found), found, STEPS, fitted)
         stated = fitted
     tell("what the logs determine")
-    names, sd, information, covariance = _told(whole.moved(found), found, linear, whiten, stated)
+    names, sd, information, covariance = _sensitivities(whole.moved(found), found, linear, whiten, stated)
     tell("held-out logs")
     before, after = _held_out(whole.moved(found), found, stated) if judged else ({}, {})
     return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
 
 
 def _stretches(recordings: Sequence[Recording]) -> list[Recording]:
-    """The logs, or where there is only one its halves, so that one can be held out."""
+    """The logs, or the halves of a single one, so that one can be held out."""
     if len(recordings) > 1:
         return list(recordings)
     (log,) = recordings
@@ -218,21 +222,21 @@ def _stretches(recordings: Sequence[Recording]) -> list[Recording]:
 
 
 def _scales(composed: Composed, residual: np.ndarray) -> np.ndarray:
-    """Root mean square (N,) of each row's channel, the noise's at least, times the root of
-    how many neighbouring rows say the same."""
+    """Scale (N,) of each row: its channel's root mean square, at least the noise's, times the root of the
+    number of neighbouring rows that repeat each other."""
     rows = composed.rows
     out = np.zeros(rows.log.size)
     for c in range(len(rows.channels)):
         mine = rows.channel == c
         parts = [residual[mine & (rows.window == w)] for w in np.unique(rows.window[mine])]
         seen = [np.nan_to_num(part) for part in parts if part.size]
-        out[mine] = np.sqrt(np.mean(np.concatenate(seen) ** 2) * _repeated(seen)) if seen else 0.0
+        out[mine] = np.sqrt(np.mean(np.concatenate(seen) ** 2) * _repeats(seen)) if seen else 0.0
     return np.maximum(out, np.sqrt(rows.variance))
 
 
-def _repeated(parts: Sequence[np.ndarray]) -> float:
-    """How many neighbours say the same: 1 + 2 (rho_1 + rho_2 + ..), as long as these are of the noise's sign
-    (Geyer, Statistical Science 7, 1992)."""
+def _repeats(parts: Sequence[np.ndarray]) -> float:
+    """How many neighbouring rows repeat each other: 1 + 2 (rho_1 + rho_2 + ..), up to the first
+    autocorrelation that is none (Geyer, Statistical Science 7, 1992)."""
     total, out = sum(float(p @ p) for p in parts), 1.0
     for lag in range(1, max(p.size for p in parts)):
         rho = sum(float(p[lag:] @ p[:-lag]) for p in parts) / max(total, 1e-300)
@@ -243,12 +247,13 @@ def _repeated(parts: Sequence[np.ndarray]) -> float:
 
 
 def _over_noise(linear: Linear) -> float:
-    """Mean square of what is left, over the noise's."""
+    """Mean square of the residual, over the noise's."""
     return float(np.mean(np.nan_to_num(linear.residual) ** 2 / linear.rows.variance))
 
 
 def _cost(composed: Composed, point: Point) -> float:
-    """How far free runs are from the logs, in units of the channels' spread; infinite where one diverges."""
+    """Mean square of free runs' residuals in units of the channels' spread; infinite where a run diverges or
+    leaves that spread."""
     left = composed.rows.observed - base_at(composed, point).rows
     if not np.isfinite(left).all():
         return np.inf
@@ -265,8 +270,8 @@ def _spread(composed: Composed) -> np.ndarray:
 
 
 def without_starts(composed: Composed, linear: Linear, scale: np.ndarray) -> Whiten:
-    """Rows in units of a scale (N,), what their log's uncertain start makes of them taken off:
-    (1 + U U')^(-1/2) by the singular values of U."""
+    """A whitener that divides rows by a scale (N,) and removes what their log's uncertain start explains: (1
+    + U U')^(-1/2), by the singular values of U."""
     parts = []
     for window, rows in zip(composed.windows, linear.rows.of, strict=True):
         doubt = [linear.starts[n][rows] * d for n, d in window.doubt.items()]
@@ -285,33 +290,40 @@ def without_starts(composed: Composed, linear: Linear, scale: np.ndarray) -> Whi
 
 
 def _whitener(composed: Composed, linear: Linear) -> Whiten:
-    """Rows in units of what is left of their channel, less their starts."""
+    """A whitener by the rows' scales and starts."""
     return without_starts(composed, linear, _scales(composed, linear.residual))
 
 
 def _least_squares(
     composed: Composed, point: Point, steps: int, free: Sequence[str]
 ) -> tuple[Point, Linear, Whiten]:
-    """Where squares are least, from a point of which some effects are free, the gap there and how rows are
-    whitened."""
+    """Fit the `free` effects from a point.
+
+    Returns:
+        The point, the gap linearised there, and how its rows are whitened.
+    """
     linear = linearise(composed, point, [])
     for _ in range(ROUNDS if steps == STEPS else 1):
-        point = moved_to(composed, linear, _whitener(composed, linear), point, free, steps)
+        point = fit_effects(composed, linear, _whitener(composed, linear), point, free, steps)
         linear = linearise(composed, point, [], linear.starts)
     return point, linear, _whitener(composed, linear)
 
 
-def _told(
+def _sensitivities(
     composed: Composed, point: Point, linear: Linear, whiten: Whiten, free: Sequence[str]
 ) -> tuple[tuple[tuple[str, str], ...], np.ndarray, np.ndarray, np.ndarray]:
-    """Names and priors' sd (p,) of all parameters, the logs' information of them in these units, and their
-    covariance."""
+    """What the logs tell of the free effects' parameters.
+
+    Returns:
+        Their names, the priors' sd (p,), the logs' information (p, p) in these units, and the covariance (p,
+            p).
+    """
     names = tuple((e, p) for e in free for p in composed.effects[e].parameters)
     sd = np.array([composed.effects[e].parameters[p].sd for e, p in names])
     base, columns = base_at(composed, point), np.zeros((linear.residual.size, len(names)))
     for effect in free:
         mine, step = np.array([e == effect for e, _ in names]), None
-        for _ in range(2):  # by a usual step, and by one as fine as the parameter is told
+        for _ in range(2):  # by a usual step, then one as fine as the parameter is determined
             one = vary(composed, base, linear.starts, effect, step=step, shifted=False)
             if one is None:
                 break
@@ -324,7 +336,7 @@ def _told(
 def _held_out(
     composed: Composed, found: Point, free: Sequence[str]
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Root mean squares by channel of free runs along logs that a fit did not see, before and after."""
+    """Root mean squares by channel of free runs along held-out logs, nominal and fitted to the others."""
     rows, nominal = composed.rows, {n: composed.effects[n].neutral() for n in found}
     before = rows.observed - base_at(composed, nominal).rows
     every = range(len(composed.recordings))

@@ -1,34 +1,33 @@
-"""What changed of a robot between two sets of its logs: OLD, which a model is calibrated on, and NEW.
+"""What changed of a robot between two sets of logs: OLD, which the model is calibrated on, and NEW.
 
-A log is read as y = f(theta, its commands) + what the model gets wrong, f the simulator run freely along the
-whole log and theta its parameters (their prior is the map's); NEW has theta + delta, delta nothing or in one
-or two effects. theta and delta are fitted together, OLD's part in theta as a quadratic about its own fit.
-What the model gets wrong has long tails and is alike all along a motion (`simgap.robots.unchanged`), so how
-sure anything is cannot be counted in rows. It is learned between motions, and by one principle:
+A log is modelled as y = f(theta, its commands) + model error, f being the simulator run freely along the
+whole log and theta its parameters, with the map's prior. NEW has theta + delta, where delta is nothing or in
+one or two effects. theta and delta are fitted together, OLD's part as a quadratic in theta about its own fit.
+Model error has long tails and is alike all along a motion (`simgap.robots.unchanged`), so certainty cannot be
+counted in rows. It is learned between motions:
 
-* *How large*: delta's variance is what leaving out OLD's motions one by one makes of it, and NEW's (the
-  delete-one jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's
-  degrees of freedom. This takes in whatever makes motions disagree: the model's error, repeats, noise, and
-  how little they tell of theta. Motions do not disagree in what is wrong alike in all of them. So to it
-  comes what delta moves by when the prior's mean, one more observation, moves by its sd; what it moves by
-  when all else that was fitted to OLD is by DRIFT otherwise in NEW, for laws of friction hold about the load
-  and speed that they were fitted at, and no robot is on two days the same; and RESPONSE of delta itself, by
-  which the model may answer a change too much or too little.
+* *How large*: delta's variance is that of leaving out OLD's and NEW's motions one by one (the delete-one
+  jackknife in two strata: Efron and Stein, Annals of Statistics 9, 1981), Student's t with Welch's degrees of
+  freedom. This includes whatever makes motions disagree: model error, repeats, noise, and how little they say
+  of theta. What is wrong alike in all motions makes none disagree, so three terms are added: how delta moves
+  when the prior's mean moves by its sd; how it moves when all else that was fitted to OLD differs by DRIFT in
+  NEW, as laws of friction hold about the load and speed they were fitted at and no robot is the same on two
+  days; and RESPONSE of delta itself, by which the model may answer a change too much or too little.
 * *Which*: an explanation's energy is minus its log evidence (Laplace's, delta's prior a Cauchy in its
-  coordinates) by the fit to all motions together. A row counts as many times less as rows depend on each
-  other, which OLD's motions show by how far each pulls theta. What one motion says of delta alone is little:
-  a free swing tells mass from length only because slower motions know the friction. An explanation is ruled
-  out where it is less likely than RIVAL of the best, and the odds are worth no more than what a second
-  small change of anything gains beyond the best: as much is the model's own error.
-* *Whether*: a change is one that is likelier than nothing by more than the number of candidates, and takes a
-  share that matters, of the energy and of what motions of NEW that took no part are missed by. Where OLD
-  never made these motions, what a model gets wrong in them is not known: then this must hold from motion to
-  motion, and delta be that far from nothing, both by Student's t. A second change is sought only where the
-  first fits NEW's logs worse than OLD's motions are predicted.
-* *Whether any*: unknown, where NEW's motions are predicted worse than OLD's were by OLD's others, from motion
-  to motion, and most of that is left.
+  coordinates) from the fit to all motions together. Rows count less by their dependence on each other, which
+  OLD's motions show by how far each pulls theta. One motion says little of delta alone: a free swing tells
+  mass from length only because slower motions determine the friction. An explanation is ruled out where it is
+  less likely than RIVAL of the best, where odds below what a second small change of anything gains beyond the
+  best count for nothing: so much is model error.
+* *Whether*: a change is likelier than nothing by more than the number of candidates, and takes a share that
+  matters of the energy and of what held-out motions of NEW are missed by. Model error in motions that OLD
+  never made is unknown: then the gain must also hold from motion to motion, or delta be that far from
+  nothing, by Student's t. A second change is sought only where the first fits NEW's logs worse than OLD's
+  motions are predicted.
+* *Whether unknown*: NEW's motions are predicted worse than OLD's were by OLD's others, from motion to motion,
+  and most of that is left.
 
-A change of what is positive is of its logarithm (a gain doubled: log 2), of all else in usual sizes.
+A change of a positive quantity is one of its logarithm (a gain doubled: log 2), of all others in usual sizes.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from hmmseg.errors import InputError
 from simgap.progress import Progress, silent
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
-from simgap.robots.fit import Local, descended
+from simgap.robots.fit import Local, minimise
 from simgap.robots.linear import base_at
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import noises
@@ -56,8 +55,8 @@ from simgap.robots.unchanged import (
     Coordinates,
     Old,
     Runs,
-    halved,
-    learned,
+    best_of_halves,
+    fit_old,
     loss,
     units_of,
     without_broken,
@@ -67,25 +66,27 @@ from simgap.robots.windows import LENGTH
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-STAGES = 8  # look: what a progress bar counts
+STAGES = 8  # look: stages that a progress bar counts
 LADDER = (-1.2, -0.6, -0.25, 0.25, 0.6, 1.2)  # numerics: changes to rank candidates by
-WIDER = 8.0  # numerics: scales that a change is sought by first: far from it all of a log is a tail
-RUNGS = np.linspace(-2.1, 2.1, 43)  # numerics: from which one is fitted; a free swing has narrow valleys
-TRIED, PAIRED, SECOND = 5, 2, 4  # numerics: changes fitted exactly, of those joined in pairs, and with them
-CHANGED = 0.03  # chosen: of unchanged robots, those that may be called changed
-MATTERS = 0.1  # chosen: of what is missed of new logs, what a change must take; less a day may make
-DRIFT = 0.1  # prior: of a parameter, or of its usual size: by how much what is fitted differs in NEW
-RESPONSE = 0.03  # prior: of a change: by how much a model answers it wrongly in all motions alike
-RIVAL = 0.05  # chosen: of right explanations, those that a wrong one may rule out
-UNKNOWN = 0.01  # chosen: of unchanged robots, those whose misfit may be called unknown
+WIDER = 8.0  # numerics: factor of the scales in a first search: far from a change all of a log is a tail
+RUNGS = np.linspace(-2.1, 2.1, 43)  # numerics: where fits begin; a free swing has narrow valleys
+TRIED, PAIRED, SECOND = 5, 2, 4  # numerics: changes fitted, those of them paired, and their partners
+CHANGED = 0.03  # chosen: share of unchanged robots that may be called changed
+MATTERS = 0.1  # chosen: share of NEW's loss that a change must take; less may differ from day to day
+DRIFT = 0.1  # prior: share of a parameter, or of its usual size, by which a fitted one differs in NEW
+RESPONSE = 0.03  # prior: share of a change by which a model answers it wrongly in all motions alike
+RIVAL = 0.05  # chosen: share of right explanations that a wrong one may rule out
+UNKNOWN = 0.01  # chosen: share of unchanged robots whose misfit may be called unknown
 
 
 @dataclass(frozen=True)
 class Change:
-    """One explanation: coordinates `x` (k,) of changed `effects`, by how much they change, standard
-    deviations `sd` (k,) with `freedom` (k,) degrees, minus its log evidence (`energy` [nats]), `left` (M,):
-    how motions of NEW that took no part are missed [nats a row], and `theta` (p,): OLD's coordinates as NEW's
-    logs have moved them."""
+    """One explanation.
+
+    `effects`: what changed; `x`: by how much (k,), in coordinates; `sd`, `freedom`: standard deviations (k,)
+    and their degrees of freedom; `energy`: minus the log evidence [nats]; `left`: loss (M,) of NEW's motions
+    that took no part [nats a row]; `theta`: OLD's coordinates (p,) as NEW's logs have moved them.
+    """
 
     effects: tuple[str, ...]
     x: np.ndarray
@@ -97,15 +98,17 @@ class Change:
 
     @property
     def by_chance(self) -> float:
-        """How often its surest coordinate is as far from nothing where nothing changed."""
+        """The p-value of its surest coordinate, were nothing changed."""
         each = 2 * student.sf(np.abs(self.x) / np.maximum(self.sd, 1e-12), self.freedom)
         return min(1.0, self.x.size * float(each.min()))
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What some `effects` may have changed: `of`, coordinates of all that is fitted and of the effects, and
-    which of them are the effects' (`mine`). Its own coordinates z are OLD's theta (p,) and changes (k,)."""
+    """What some `effects` may have changed. Its coordinates z are OLD's theta (p,), then changes (k,).
+
+    `of`: coordinates of all that is fitted and of the effects; `mine`: which of them are the effects' (k,).
+    """
 
     runs: Runs
     old: Old
@@ -133,51 +136,58 @@ class Hypothesis:
         return self.of.point(self.old.point, self.full(z))
 
     def cost(self, z: np.ndarray, without: int = -1) -> float:
-        """Minus the log likelihood of NEW, `without` one of its units, and, as a quadratic, of OLD."""
+        """Minus the log likelihood of NEW, `without` one of its units, and of OLD as a quadratic."""
         theta = z[: len(self.old.theta.names)]
         kept = self.runs.losses(self.point(z), without)[0]
         return kept + float(0.5 * theta @ self.old.bend @ theta)
 
     def columns(self, z: np.ndarray, only: Sequence[str] | None = None) -> np.ndarray:
-        """Derivatives (N, p + k) of NEW's rows; of `only` some effects where these are named, else 0."""
+        """Derivatives (N, p + k) of NEW's rows; with `only` some effects, 0 of all else."""
         slopes = self.runs.slopes(self.point(z), self.of, self.full(z), only)
         theta = slopes[:, : len(self.old.theta.names)]
         return np.hstack([theta if only is None else np.zeros_like(theta), slopes[:, self.mine]])
 
 
 class Comparison:
-    """NEW logs against what is known of OLD: exact fits of changes."""
+    """NEW logs against what is known of OLD: exact fits of changes.
+
+    Args:
+        composed: The model along NEW.
+        old: What is known of OLD.
+        candidates: What may have changed.
+        unit: Unit (N,) of each row of NEW.
+    """
 
     def __init__(self, composed: Composed, old: Old, candidates: Sequence[str], unit: np.ndarray) -> None:
         self.composed, self.old, self.candidates = composed, old, candidates
         self.runs = Runs(composed, old.point, unit, old.scale)
 
     def fit(self, effects: tuple[str, ...], starts: Sequence[np.ndarray]) -> Change:
-        """An explanation, from the best of some starts of its coordinates."""
+        """Fit an explanation, from the best of some starts of its coordinates."""
         old, runs, of = self.old, self.runs, Hypothesis.about(self.runs, self.old, effects)
         p, k = len(old.theta.names), of.mine.size
         bend = 1e-6 * np.eye(p + k)
         bend[:p, :p] = old.bend
         begun = [np.concatenate([np.zeros(p), x]) for x in starts]
         for wider in (WIDER, 1.0):
-            runs.scaled(wider * old.scale)
+            runs.set_scales(wider * old.scale)
             z = min(begun, key=of.cost)
             theta = of.columns(z)
             theta[:, p:] = 0.0
 
             def local(z: np.ndarray, theta=theta) -> Local:  # theta moves little, and its columns less
-                information, pull = runs.told(runs.rows(of.point(z)), theta + of.columns(z, effects))
+                information, pull = runs.information(runs.rows(of.point(z)), theta + of.columns(z, effects))
                 return information.sum(0) + bend, pull.sum(0) - bend @ z
 
-            z = descended(of.cost, local, z, far=FAR)
+            z = minimise(of.cost, local, z, far=FAR)
             begun = [z]
-        information, pull = runs.told(runs.rows(of.point(z)), of.columns(z))
+        information, pull = runs.information(runs.rows(of.point(z)), of.columns(z))
         total, rest = information.sum(0) + bend, pull.sum(0) - bend @ z
         left = np.zeros(len(runs.units))
         moved = [np.zeros((n, k)) for n in map(len, (runs.units, old.units))]
         for u in range(left.size):
             step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
-            there = halved(lambda z, u=u: of.cost(z, u), z, step)
+            there = best_of_halves(lambda z, u=u: of.cost(z, u), z, step)
             left[u], moved[0][u] = runs.losses(of.point(there), u)[1], (there - z)[p:]
         for u in range(len(old.units)):
             less, push = total.copy(), rest.copy()
@@ -198,11 +208,11 @@ class Comparison:
         return Change(effects, x, sd, freedom, of.cost(z) / old.dependence + occam, left, z[:p])
 
     def scanned(self, about: Change | None = None) -> dict[str, tuple[float, np.ndarray]]:
-        """By candidate the least cost over a ladder of changes of it, theta held, and where that is."""
+        """The least cost by candidate over a ladder of changes, theta held, and the change that gives it."""
         out, known, first = {}, () if about is None else about.effects, np.zeros(len(self.old.theta.names))
         if about is not None:
             first = np.concatenate([about.theta, about.x])
-        self.runs.scaled(WIDER * self.old.scale)
+        self.runs.set_scales(WIDER * self.old.scale)
         for name in (n for n in self.candidates if n not in known):
             of = Hypothesis.about(self.runs, self.old, (*known, name))
             k = len(self.old.theta.names) + of.mine.size - first.size
@@ -213,23 +223,22 @@ class Comparison:
 
     @staticmethod
     def _rungs(x: np.ndarray) -> list[np.ndarray]:
-        """Changes to begin a fit from: of one coordinate many."""
+        """Changes to begin a fit from; many of a single coordinate."""
         return [np.zeros(x.size)] if x.size > 1 else [np.array([r]) for r in RUNGS]
 
     @property
     def missed(self) -> np.ndarray:
-        """How each motion of NEW would be missed (M,) by OLD's others: as OLD's own, if OLD made all, or as
-        its mean."""
+        """The loss (M,) expected of each motion of NEW: OLD's own, if OLD made them all, else OLD's mean."""
         old = self.old.missed
         mine = np.searchsorted(self.old.units, self.runs.units)
         return old[mine] if self.paired else np.full(mine.size, old.mean())
 
     def excess(self, change: Change) -> np.ndarray:
-        """By how much more each motion of NEW is missed (M,) than OLD's."""
+        """The loss (M,) of each motion of NEW beyond that."""
         return change.left - self.missed
 
     def leaves(self, change: Change) -> bool:
-        """Whether NEW's logs are fitted worse than OLD's motions are by fits that did not see them."""
+        """Whether NEW's logs are fitted worse than OLD's motions are predicted."""
         count = np.bincount(np.searchsorted(self.runs.units, self.runs.unit))
         return bool(change.energy > float(count @ self.missed) / self.old.dependence)
 
@@ -239,11 +248,11 @@ class Comparison:
         return bool(np.isin(self.runs.units, self.old.units).all())
 
     def chance(self, change: Change, beyond: Change) -> float:
-        """How likely one of all candidates is as much likelier than a simpler explanation by chance."""
+        """The p-value of a gain over a simpler explanation, with all candidates tried."""
         return min(1.0, len(self.candidates) * float(np.exp(min(change.energy - beyond.energy, 0.0))))
 
     def needed(self, change: Change, beyond: Change) -> bool:
-        """Whether an explanation is one that a simpler one cannot do without (see above)."""
+        """Whether an explanation is needed beyond a simpler one (*Whether*, above)."""
         shares = 1 - change.left / np.maximum(beyond.left, 1e-12)
         taken = min(float(shares.mean()), 1 - change.energy / beyond.energy)
         if self.chance(change, beyond) >= CHANGED or taken < MATTERS:
@@ -251,7 +260,7 @@ class Comparison:
         return self.paired or max(by_chance(shares), len(self.candidates) * change.by_chance) < CHANGED
 
     def searched(self) -> list[Change]:
-        """Nothing, the most promising single changes, and pairs about the best of them."""
+        """Fit nothing, the most promising single changes, and pairs about the best of them."""
         nothing = self.fit((), [np.zeros(0)])
         scan = self.scanned()
         names = sorted(scan, key=lambda n: scan[n][0])[:TRIED]
@@ -278,9 +287,13 @@ class Comparison:
 
 
 def added_by_drift(total: np.ndarray, before: np.ndarray, drift: np.ndarray) -> np.ndarray:
-    """What is added to the variances (q,) of coordinates that are known by an information of `total` (q, q)
-    if the first p of them, of which OLD's is `before` (p, p), differ by independent amounts of variance
-    `drift` (p,) in NEW."""
+    """What drift adds to the variances of q coordinates.
+
+    Args:
+        total: Their information (q, q).
+        before: OLD's part of it, on the first p (p, p).
+        drift: Variances (p,) by which these differ, independently, in NEW.
+    """
     loose, p = total.copy(), drift.size
     if p:
         loose[:p, :p] += np.linalg.inv(np.linalg.inv(before) + np.diag(drift)) - before
@@ -288,9 +301,12 @@ def added_by_drift(total: np.ndarray, before: np.ndarray, drift: np.ndarray) -> 
 
 
 def jackknife(strata: Sequence[np.ndarray], known: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations (k,) and Welch's degrees of freedom of what was computed with one unit left out, by
-    stratum (M, k), and has a `known` variance (k,) besides; nothing is known where a stratum of one is left
-    without."""
+    """Standard deviations (k,) and Welch's degrees of freedom (k,) from leaving out one unit at a time.
+
+    Args:
+        strata: Estimates (M, k) without each unit, by stratum; a stratum of one unit leaves them unknown.
+        known: Further variance (k,).
+    """
     k = strata[0].shape[1]
     parts, freedom = [], []
     for left in strata:
@@ -305,9 +321,14 @@ def jackknife(strata: Sequence[np.ndarray], known: np.ndarray | float = 0.0) -> 
 
 @dataclass(frozen=True)
 class Changes:
-    """What was found: `verdict` none, named, set or unknown; the `best` explanation and `others` that NEW's
-    logs do not rule out, `nothing` for comparison, all `tried` with their probabilities; `worse`: how often
-    an unchanged robot is missed by as much as the best leaves."""
+    """What was found.
+
+    `verdict`: none, named, set or unknown; `best`, `others`: the best explanation, and those that NEW's logs
+    do not rule out; `nothing`, `tried`: no change, and all explanations that were fitted; `probabilities`: of
+    none, unknown, and explanations; `worse`: the p-value of what the best explanation leaves, were the robot
+    unchanged; `p_value`: the p-value of the change; `old`, `runs`, `composed`: what is known of OLD, and the
+    model along NEW; `broken`: samples that were left out; `calibration`: on OLD.
+    """
 
     verdict: str
     best: Change
@@ -324,7 +345,7 @@ class Changes:
     calibration: Calibration | None
 
     def body(self) -> dict[str, Any]:
-        """The document, with the keys of every diagnosis; `changes` are its causes in a line each."""
+        """The document, with the keys of every diagnosis; `changes` has a line for each cause."""
         best, nothing, names = self.best, self.nothing, sorted(self.best.effects)
         others = sorted({n for c in self.others for n in c.effects} - {*names})
         before, after, floor = (float(v.mean()) for v in (nothing.left, best.left, self.old.missed))
@@ -378,8 +399,7 @@ class Changes:
         return out
 
     def _next_experiment(self, separates: Sequence[str]) -> dict[str, Any] | None:
-        """Of the motions run, the one by whose losses the best explanation and the closest other differ most;
-        None where that is less than a nat."""
+        """Repeat the motion by whose losses the best explanation and its closest rival differ most."""
         if self.verdict != "set":
             return None
         count = np.bincount(np.searchsorted(self.runs.units, self.runs.unit)) / self.old.dependence
@@ -390,11 +410,11 @@ class Changes:
 
     @property
     def over(self) -> float:
-        """How far NEW's motions are missed worse than OLD's, about as a factor on root mean squares."""
+        """By how much NEW's motions are missed worse than OLD's, about as a factor on root mean squares."""
         return float(np.exp((self.best.left.mean() - self.old.missed.mean()) / 2))
 
     def where(self) -> list[dict[str, Any]]:
-        """Logs that an unchanged robot would have to miss by more than OLD's motions are missed."""
+        """Logs that an unchanged robot would miss by more than OLD's motions are missed."""
         rows = self.runs.rows(self.old.point)
         size = np.array([float(np.mean(loss(rows[self.runs.log == i]))) for i in np.unique(self.runs.log)])
         spread = max(float(np.std(self.old.missed, ddof=1)) if self.old.missed.size > 1 else 0.0, 1e-3)
@@ -412,7 +432,7 @@ class Changes:
         ]  # fmt: skip
 
     def lines(self) -> list[str]:
-        """Every change of the best explanation in a line: by how much, from what to what."""
+        """A line for every change of the best explanation: by how much, from what to what."""
         out = []
         for name, v in self.sizes().items():
             low, high = v["interval_90"]
@@ -423,13 +443,13 @@ class Changes:
         return out
 
     def point(self) -> Point:
-        """NEW's parameters by the best explanation, and all else as it was."""
+        """NEW's parameters by the best explanation, all else unchanged."""
         at = Coordinates.of(self.composed, self.old.point, self.best.effects)
         return at.point(self.old.point, self.best.x)
 
     def sizes(self, of: Change | None = None) -> dict[str, dict[str, Any]]:
-        """Of an explanation (the best by default) each parameter as it was and is, with 90 % intervals, and
-        as a ratio where it is changed by factors."""
+        """Each parameter of an explanation (by default the best), before and now, with 90 % intervals, and as
+        a ratio where it changed by a factor."""
         change = self.best if of is None else of
         at = Coordinates.of(self.composed, self.old.point, change.effects)
         reach = student.ppf(0.95, change.freedom) * np.minimum(change.sd, 1e6) if change.x.size else change.x
@@ -457,19 +477,19 @@ def changes(
     calibration: Calibration | None = None,
     known: Old | None = None,
 ) -> Changes:
-    """What changed between OLD logs of a robot and NEW ones.
+    """Find what changed between OLD logs of a robot and NEW ones.
 
     Args:
-        simulator: a model of the robot as it was.
-        old: logs of the robot as it was, two at least; the more motions the better.
-        new: logs of it as it is.
-        effects: what may have changed, by name; those that are `fitted` are calibrated on OLD.
-        tell: called with a description of each stage.
-        calibration: of the same old logs, where that is known.
-        known: what was learned of the same old logs before, where NEW makes the same motions as then.
+        simulator: A model of the robot as it was.
+        old: Logs of the robot as it was, two or more; the more motions the better.
+        new: Logs of the robot as it is.
+        effects: What may have changed, by name; those that are `fitted` are calibrated on OLD.
+        tell: Called with a description of each stage.
+        calibration: On the same old logs, where that is known.
+        known: What was learned of the same old logs before, where NEW makes the same motions as then.
 
     Raises:
-        InputError: there are too few logs, or the simulator does not follow them.
+        InputError: There are too few logs, or the simulator does not follow them.
     """
     if len(old) < 2:
         raise InputError("--healthy", f"has {len(old)} log", "two at least, to see how far logs differ")
@@ -493,7 +513,7 @@ def changes(
     units = units_of(before, composed)
     if known is None or not np.array_equal(known.units, np.unique(units[0])):
         tell("how far the old logs differ")
-        known = learned(before, calibration, units[0])
+        known = fit_old(before, calibration, units[0])
     tell("changes in the new logs")
     found = Comparison(composed, known, candidates, units[1])
     return _concluded(found.searched(), found, (*broken, *more), calibration)
@@ -529,8 +549,8 @@ def _concluded(
 
 
 def _unlike(new: np.ndarray, old: np.ndarray) -> float:
-    """How often NEW's motions are missed by so much more than other motions of OLD, by Student's t of their
-    logarithms, as some motions are missed by far more than others."""
+    """The p-value of NEW's losses (n,) exceeding OLD's (m,) as those of other motions would, by Student's t
+    of their logarithms, as some motions are missed by far more than others."""
     if old.size < 2:
         return 0.5
     a, b = np.log(np.maximum(new, 1e-12)), np.log(np.maximum(old, 1e-12))
@@ -539,9 +559,11 @@ def _unlike(new: np.ndarray, old: np.ndarray) -> float:
 
 
 def _chances(best: Change, weight: Mapping[str, float], p_value: float, worse: float) -> dict[str, float]:
-    """A probability of nothing, of the unknown, and of the explanations as simple as the best by weight. Of a
-    p-value the odds of nothing are at least -e p log p (Sellke, Bayarri & Berger, American Statistician 55,
-    2001)."""
+    """Probabilities of none, of unknown, and by weight of the explanations as simple as the best.
+
+    A p-value leaves odds of nothing of at least -e p log p (Sellke, Bayarri & Berger, American Statistician
+    55, 2001).
+    """
 
     def odds(p: float) -> float:
         p = max(p, 1e-12)

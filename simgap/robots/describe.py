@@ -1,4 +1,4 @@
-"""A robot's diagnosis as the JSON document has it."""
+"""The JSON document of a robot's diagnosis."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from simgap.attribution.verdict import entries, rows
 from simgap.robot_effects.base import entry
 from simgap.robots.diagnose import RobotDiagnosis
-from simgap.robots.search import Settled
+from simgap.robots.search import FittedSet
 
-SEEN = 3.0  # chosen: standard deviations of noise's squares: a smaller gap of a phase is none
+SEEN = 3.0  # chosen: standard deviations of the noise's squares; a phase with a smaller gap has none
 
 
 def body(found: RobotDiagnosis) -> dict[str, Any]:
-    """The document: verdict, causes, probabilities, where, effects, shrinkage, and what cannot be told."""
+    """The document: verdict, causes, probabilities, where, effects, shrinkage, what cannot be told apart."""
     v = found.verdict
     shares = {n: v.shares.of_effect(k) for k, n in enumerate(v.shared)}
     attribution = {n: (p, *shares.get(n, (0.0, (0.0, 0.0)))) for n, p in v.chance.items()}
@@ -38,41 +38,35 @@ def body(found: RobotDiagnosis) -> dict[str, Any]:
 
 
 def _effects(found: RobotDiagnosis) -> dict[str, Any]:
-    """The best set together, each of it, and those that could take a cause's place, each at its best."""
-    v, search = found.verdict, found.search
-    out: dict[str, Any] = {}
-    if v.causes:
-        names = v.causes
-        out["+".join(names)] = _entry(found, found.best, names)
-        for name in names if len(names) > 1 else ():
-            out[name] = _entry(found, found.best, (name,))
-    elif v.explanation:
-        for name in v.explanation:
-            out[name] = _entry(found, found.best, (name,))
+    """The best set, each of its effects, and those that could replace a cause, each at its best."""
+    v = found.verdict
+    sets = [v.causes] if v.causes else []
+    sets += [(name,) for name in v.causes or v.explanation]
+    out = {"+".join(names): _entry(found, found.best, names) for names in sets}
     for name in v.indistinguishable:
-        having = [s for s in search.known.values() if name in s.names]
+        having = [s for s in found.search.fitted.values() if name in s.names]
         if having:
             out[name] = _entry(found, max(having, key=lambda s: s.score), (name,))
     return out
 
 
-def _entry(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) -> dict[str, Any]:
+def _entry(found: RobotDiagnosis, one: FittedSet, effects: tuple[str, ...]) -> dict[str, Any]:
     far = found.shrinkage
     if one is not found.best or effects != found.verdict.causes:
         far = None
     return {
         "parameters": parameters(found, one, effects),
-        "log_evidence": one.score - found.search.known[frozenset()].score,
+        "log_evidence": one.score - found.search.fitted[frozenset()].score,
         "heldout_score": 0.0 if far is None else 0.5 * (far.before - far.after) * one.linear.residual.size,
         "property_shift": {},
     }
 
 
-def parameters(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
-    """Of a set's effects: short name, or effect and short name where there are several, to its posterior.
+def parameters(found: RobotDiagnosis, one: FittedSet, effects: tuple[str, ...]) -> dict[str, dict[str, Any]]:
+    """Posteriors of a set's effects, by short name, or by effect and short name where there are several.
 
-    Standard deviations are at least what leaving out folds shows (the jackknife of Quenouille and Tukey), and
-    hold what the parameter is in other sets that were fitted, by their weight.
+    Standard deviations are at least those of leaving out folds (the jackknife of Quenouille and Tukey), and
+    include how the parameter differs in other fitted sets, by their weight.
     """
     mean, sd = _posterior(found, one)
     out: dict[str, dict[str, Any]] = {}
@@ -84,7 +78,7 @@ def parameters(found: RobotDiagnosis, one: Settled, effects: tuple[str, ...]) ->
 
 
 def _posterior(
-    found: RobotDiagnosis, one: Settled
+    found: RobotDiagnosis, one: FittedSet
 ) -> tuple[dict[tuple[str, str], float], dict[tuple[str, str], float]]:
     effects, names = found.composed.effects, one.names
     keys = [(n, short) for n in names for short in effects[n].parameters]
@@ -97,7 +91,7 @@ def _posterior(
     mean = {key: float(one.point[key[0]][key[1]]) for key in keys}
     sd = dict(zip(keys, (own * usual).tolist(), strict=True))
     for key in keys:
-        rivals = [s for s in found.search.known.values() if key[0] in s.names]
+        rivals = [s for s in found.search.fitted.values() if key[0] in s.names]
         weight = np.exp(np.minimum([s.score - one.score for s in rivals], 0.0))
         apart = np.array([s.point[key[0]][key[1]] - mean[key] for s in rivals])
         sd[key] = float(np.sqrt(sd[key] ** 2 + weight @ apart**2 / weight.sum()))
@@ -105,8 +99,8 @@ def _posterior(
 
 
 def _fitted(found: RobotDiagnosis, numeric: bool) -> dict[str, Any]:
-    """What was fitted along: before (nothing else acts) and with the best set; the simulation's own numbers
-    apart."""
+    """What was fitted along, with nothing else acting (before) and with the best set; the simulation's own
+    numbers apart."""
     out = {}
     for name, before in found.plain.point.items():
         if found.composed.effects[name].numeric is not numeric:
@@ -133,8 +127,8 @@ def _shrinkage(found: RobotDiagnosis) -> dict[str, Any] | None:
 
 
 def _by_phase(found: RobotDiagnosis, units: dict[str, str]) -> dict[str, Any]:
-    """Of each phase the share of its gap that is gone on held-out logs (None where there is none to speak
-    of), and by channel the root mean square that is left."""
+    """By phase the share of the gap that is gone on held-out logs (None where there is hardly a gap), and by
+    channel the root mean square before and after."""
     far, rows = found.shrinkage, found.composed.rows
     if far is None:
         return {}

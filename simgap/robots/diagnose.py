@@ -18,7 +18,7 @@ from simgap.robots.calibrate import Calibration, calibrate
 from simgap.robots.linear import Linear
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Phases, folds_of, noises, phases_of
-from simgap.robots.search import Search, Settled
+from simgap.robots.search import FittedSet, Search
 from simgap.robots.sets import Identifiability
 from simgap.robots.verdict import RobotVerdict, Shrinkage, next_log, shrinkage, verdict_on
 from simgap.simulators.protocol import Simulator
@@ -31,23 +31,17 @@ STAGES = 14  # look: stages that a progress bar counts at most
 class RobotDiagnosis:
     """All that was found.
 
-    Attributes:
-        composed: The model along the windows that were compared.
-        phases: Stretches of the logs by name.
-        search: All sets that were fitted.
-        best: The best of them.
-        verdict: The verdict.
-        shrinkage: Of the gap on held-out logs; None without causes.
-        identifiable: Which candidates' parameters the logs tell apart.
-        next_log: The next experiment.
-        calibrated: The model with what nobody measured fitted, where there is such.
-        warnings: One line each.
+    `composed`: the model along the windows that were compared; `phases`: stretches of the logs by name;
+    `search`: all sets that were fitted; `best`: the best of them; `verdict`: the verdict; `shrinkage`: of the
+    gap on held-out logs; None without causes; `identifiable`: which candidates' parameters the logs tell
+    apart; `next_log`: the next experiment; `calibrated`: the model with what nobody measured fitted, where
+    there is such; `warnings`: one line each.
     """
 
     composed: Composed
     phases: Phases
     search: Search
-    best: Settled
+    best: FittedSet
     verdict: RobotVerdict
     shrinkage: Shrinkage | None
     identifiable: Identifiability
@@ -58,7 +52,7 @@ class RobotDiagnosis:
     @property
     def plain(self) -> Linear:
         """The gap of the simulator as it comes, with what is fitted along at its best."""
-        return self.search.known[frozenset()].linear
+        return self.search.fitted[frozenset()].linear
 
     @property
     def linear(self) -> Linear:
@@ -149,7 +143,7 @@ def _diagnosed(
     fold = folds_of(composed.rows, len(composed.recordings), groups)
     search = Search(composed, wanted, fold, lambda: calibrated(UNMEASURED))
     best = search.forced(tuple(forced)) if forced else search.run(tell)
-    nothing = search.known[frozenset()]
+    nothing = search.fitted[frozenset()]
     for name in search.diverged:
         said(f"{name}: the simulator diverges with it, and it is left out")
     if nothing.linear.dropped:

@@ -1,4 +1,4 @@
-"""The exact fit of a set: the point of least squares of whitened residuals, with priors."""
+"""The exact fit of a set of effects: least squares of whitened residuals, with priors and within bounds."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from simgap.robots.model import Composed, Point
 
 Whiten = Callable[[np.ndarray], np.ndarray]  # rows (N,) or columns (N, k)
 STEPS = 8  # numerics: of a least-squares fit, at most
-HALVINGS = 5  # numerics: of a step that straight lines took too far
-FLAT = 1e-12  # numerics: of the usual bend, so that one that is none in some direction has a least
-SHORTEN, SHORTER = 0.1, 10.0  # numerics: damping of a step that was too long, and factor of the next one's
+HALVINGS = 5  # numerics: most halvings of a start, and shorter trials of a step
+FLAT = 1e-12  # numerics: of the usual curvature, so that flat directions have a minimum
+SHORTEN, SHORTER = 0.1, 10.0  # numerics: damping after a step that was too long, and its growth
 CLOSE = 0.05  # numerics: nats that a step must gain for a fit to go on
-WIDE = 3.0  # numerics: posterior standard deviations: a finite difference
-FINEST = 1e-4  # numerics: usual sizes: the least one
+WIDE = 3.0  # numerics: posterior standard deviations of a finite difference
+FINEST = 1e-4  # numerics: usual sizes of the smallest one
 
 
 Cost = Callable[[np.ndarray], float]  # of coordinates x (n,) [nats]
-Local = tuple[np.ndarray, np.ndarray]  # its curvature (n, n) and pull (n,) there
+Local = tuple[np.ndarray, np.ndarray]  # its curvature (n, n) and minus its gradient (n,) there
 
 
-def descended(
+def minimise(
     cost: Cost,
     local: Callable[[np.ndarray], Local],
     x: np.ndarray,
@@ -36,13 +36,24 @@ def descended(
     steps: int = STEPS,
     far: float = np.inf,
 ) -> np.ndarray:
-    """Where a cost is least within bounds, from x (n,): by steps of Levenberg and Marquardt (J. SIAM 11,
-    1963), each the minimum within bounds and at most so `far` in each coordinate."""
+    """Minimise a cost within bounds.
+
+    By steps of Levenberg and Marquardt (J. SIAM 11, 1963), each the minimum of the local quadratic within
+    bounds.
+
+    Args:
+        cost: The cost of coordinates x (n,) [nats]; infinite where it is not known.
+        local: Its curvature (n, n) and minus its gradient (n,) at x.
+        x: Where to begin (n,).
+        low, high: Bounds (n,).
+        steps: Most steps.
+        far: Longest step of a coordinate.
+    """
     now, damping = cost(x), 0.0
     for _ in range(steps if x.size and np.isfinite(now) else 0):
         bend, pull = local(x)
         usual = np.diag(np.maximum(np.diag(bend), 1.0))
-        # About x, so that what is held at a bound stays exactly there.
+        # Relative to x, so that a coordinate at a bound stays exactly there.
         box = np.maximum(low - x, -far), np.minimum(high - x, far)
         for _ in range(HALVINGS):
             move, _ = least(bend + (damping + FLAT) * usual, pull, *box)
@@ -59,7 +70,7 @@ def descended(
     return x
 
 
-def moved_to(
+def fit_effects(
     composed: Composed,
     linear: Linear,
     whiten: Whiten,
@@ -67,26 +78,37 @@ def moved_to(
     only: Sequence[str] | None = None,
     steps: int = STEPS,
 ) -> Point:
-    """The point of least squares of whitened residuals, from a start; priors as in attribution. `only`: the
-    effects that are moved, all by default.
+    """Fit effects to the rows.
 
-    A start that straight lines took too far, so that it is worse than where they begin, is taken back by
-    halves towards there.
+    Args:
+        composed: The model along its windows.
+        linear: The gap linearised nearby, whose diverged windows are left out.
+        whiten: Whitens rows.
+        point: Where to begin. A start that is worse than the linearisation's point is taken back towards it
+            by halves.
+        only: Effects to fit; all of the point by default.
+        steps: Most steps.
+
+    Returns:
+        The point of least squares, priors included as in the attribution.
     """
     free = {e: theta for e, theta in point.items() if only is None or e in only}
     held = {e: theta for e, theta in point.items() if e not in free}
     if not any(free.values()):
         return point
     squares = _Squares(composed, linear, whiten, held, free)
-    x = descended(squares.cost, squares.local, squares.reached(), squares.low, squares.high, steps)
+    x = minimise(squares.cost, squares.local, squares.start(), squares.low, squares.high, steps)
     return {**point, **squares.at(x)}
 
 
 @dataclass
 class _Squares:
-    """Whitened residuals and priors of the effects that are `free`, at coordinates x (n,) in usual sizes from
-    nominal, while those that are `held` stay; `latest`: the derivative is asked for where the residual was;
-    `slopes`: by effect the squares (k,) of its latest derivatives."""
+    """Squares of whitened residuals and priors at coordinates x (n,) of the `free` effects, in usual sizes
+    from nominal, with others `held`.
+
+    `latest` keeps the last rollouts, as the derivative is wanted where the residual was; `slopes` by effect
+    the squares (k,) of its last derivatives.
+    """
 
     composed: Composed
     linear: Linear
@@ -108,7 +130,7 @@ class _Squares:
         self.tails = np.array([_tails(effects[e]) for e, _ in self.names])
         for effect in self.free:
             if effect in self.linear.moved:
-                self._learn(effect, self.whiten(_finite(self.linear.moved[effect].jacobian)))
+                self._learn(effect, self.whiten(np.nan_to_num(self.linear.moved[effect].jacobian)))
 
     def at(self, x: np.ndarray) -> dict[str, Mapping[str, float]]:
         """The free effects' values."""
@@ -117,16 +139,12 @@ class _Squares:
             out.setdefault(effect, {})[short] = float(value)
         return dict(out)
 
-    def coordinates(self, point: Point) -> np.ndarray:
-        """The coordinates of a point; what it does not name is neutral."""
+    def start(self) -> np.ndarray:
+        """Where to begin: the point, halved towards the linearisation's while it is worse than that."""
         neutral = {e: self.composed.effects[e].neutral() for e in self.free}
-        value = np.array([{**neutral[e], **point.get(e, {})}[p] for e, p in self.names])
-        return np.clip((value - self.nominal) / self.sd, self.low, self.high)
-
-    def reached(self) -> np.ndarray:
-        """Where the free effects are, or half as far from the linear model's point, and half again, while
-        that is worse than there."""
-        here, x = self.coordinates(self.linear.point), self.coordinates(self.free)
+        both = self.linear.point, self.free
+        values = np.array([[{**neutral[e], **p.get(e, {})}[n] for e, n in self.names] for p in both])
+        here, x = np.clip((values - self.nominal) / self.sd, self.low, self.high)
         if np.array_equal(here, x):
             return x
         cost = self.cost(here)
@@ -137,7 +155,7 @@ class _Squares:
         return here
 
     def base(self, x: np.ndarray) -> Base:
-        """Rollouts there."""
+        """The rollouts."""
         if x.tobytes() not in self.latest:
             say(f"fitting {', '.join(self.free)}")
             self.latest.clear()
@@ -145,7 +163,7 @@ class _Squares:
         return self.latest[x.tobytes()]
 
     def residual(self, x: np.ndarray) -> np.ndarray:
-        """Infinite where a window diverges that the linear model has: a fit turns back there."""
+        """Whitened residuals and priors; infinite where a window diverges that the linearisation has."""
         mine = np.isfinite(self.linear.residual)
         found = np.where(mine, self.linear.rows.observed - self.base(x).rows, 0.0)
         white = self.whiten(found) if np.isfinite(found).all() else np.full(found.size, np.inf)
@@ -156,7 +174,7 @@ class _Squares:
         return 0.5 * float(np.sum(self.residual(x) ** 2))
 
     def local(self, x: np.ndarray) -> Local:
-        """Curvature and pull."""
+        """Curvature and minus the gradient of the cost."""
         jacobian, left = self.jacobian(x), self.residual(x)
         return jacobian.T @ jacobian, -jacobian.T @ left
 
@@ -169,7 +187,7 @@ class _Squares:
             size = len(self.composed.effects[effect].parameters)
             white = np.zeros((self.linear.residual.size, size))
             if moved is not None:
-                white = self.whiten(_finite(moved.jacobian))
+                white = self.whiten(np.nan_to_num(moved.jacobian))
                 self._learn(effect, white)
             columns.append(white)
         slope = _slope(x, self.tails)
@@ -180,40 +198,37 @@ class _Squares:
         self.slopes[effect] = np.sum((white * self.sd[mine]) ** 2, 0)
 
     def _step(self, effect: str) -> np.ndarray | None:
-        """Steps (k,) of the finite differences in usual sizes: as wide as the parameters are uncertain, for
-        what curves or kinks within a wider one is not the slope that a fit needs."""
+        """Finite differences (k,) in usual sizes, as wide as the parameters are uncertain and no wider: what
+        curves or kinks farther away is not the slope that a fit needs."""
         if effect not in self.slopes:
             return None
         return np.clip(WIDE / np.sqrt(1 + self.slopes[effect]), FINEST, STEP)
 
 
 def prior_cost(composed: Composed, point: Point) -> float:
-    """Minus the log prior density of a point, constants left out [nats]."""
+    """Minus the log prior density of a point, without constants [nats]."""
     out = 0.0
     for effect, theta in point.items():
         known = composed.effects[effect]
-        x = np.array([(v - known.parameters[p].nominal) / known.parameters[p].sd for p, v in theta.items()])
+        x = np.array([known.parameters[p].coordinate(v) for p, v in theta.items()])
         out += 0.5 * float(np.sum(_prior(x, np.full(x.size, _tails(known))) ** 2))
     return out
 
 
 def _tails(effect: RobotEffect) -> float:
-    """Over how many of its usual sizes an effect's `sd` reaches, if what is far from nominal is hardly less
-    likely the farther it is; 0 of a normal prior."""
+    """The scale of an effect's heavy-tailed prior: how many of its usual sizes its `sd` is; 0 of a normal
+    prior."""
     return effect.widened if effect.widened else float(not effect.fitted)
 
 
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, 0.0)
-
-
 def _prior(x: np.ndarray, tails: np.ndarray) -> np.ndarray:
-    """Half their squares are minus the log priors: Gauss (of tails 0), or log(1 + (tails x)^2)."""
+    """Roots (n,) of the priors: half their squares are minus the log densities, normal (`tails` 0) or log(1 +
+    (tails x)^2)."""
     return np.where(tails > 0, np.sign(x) * np.sqrt(2 * np.log1p((tails * x) ** 2)), x)
 
 
 def _slope(x: np.ndarray, tails: np.ndarray) -> np.ndarray:
-    """Derivative of `_prior`, of which that of sign(y) sqrt(2 log(1 + y^2)) is sqrt(2) at 0."""
+    """The derivative of `_prior`; that of sign(y) sqrt(2 log(1 + y^2)) is sqrt(2) at 0."""
     y = tails * x
     root = np.sqrt(2 * np.log1p(y**2))
     heavy = np.where(root > 1e-6, 2 * np.abs(y) / (1 + y**2) / np.maximum(root, 1e-6), np.sqrt(2.0))

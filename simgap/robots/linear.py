@@ -37,15 +37,10 @@ class Moved:
 class Linear:
     """The gap linearised about a point.
 
-    Attributes:
-        point: The point.
-        rows: The rows that are compared.
-        residual: Recorded less simulated values (N,); NaN where a rollout diverged.
-        starts: Derivatives (N,) of the rows by each state of their window's start.
-        moved: How effects move the rows.
-        diverged: Effects whose rollouts diverged.
-        dropped: Number of windows whose rollout diverged.
-        rates: Rates (N,) of the simulated channels.
+    `point`: the point; `rows`: the rows that are compared; `residual`: recorded less simulated values (N,);
+    NaN where a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's
+    start; `moved`: how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number
+    of windows whose rollout diverged; `rates`: rates (N,) of the simulated channels.
     """
 
     point: Point
@@ -57,9 +52,9 @@ class Linear:
     dropped: int  # windows whose rollout was not finite
     rates: np.ndarray  # (N,) the simulated channel's rate
 
-    def with_moved(self, more: Mapping[str, Moved], diverged: Sequence[str] = ()) -> Linear:
+    def with_moved(self, more: Mapping[str, Moved]) -> Linear:
         """The same with columns of effects added or replaced."""
-        return replace(self, moved={**self.moved, **more}, diverged=(*self.diverged, *diverged))
+        return replace(self, moved={**self.moved, **more})
 
 
 @dataclass(frozen=True)
@@ -101,17 +96,13 @@ def linearise(
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
     residual = composed.rows.observed - base.rows
     starts = _by_start(composed, base) if starts is None else starts
-    dropped = sum(channels is None for channels in base.read)
-    found = Linear(point, composed.rows, residual, starts, {}, (), dropped, _rates(composed, base))
-    moved, diverged = {}, []
+    dropped, every = sum(channels is None for channels in base.read), {}
     for number, name in enumerate(effects):
         say(f"{number + 1} of {len(effects)}, {name}")
-        one = vary(composed, base, starts, name)
-        if one is None:
-            diverged.append(name)
-        else:
-            moved[name] = one
-    return found.with_moved(moved, diverged)
+        every[name] = vary(composed, base, starts, name)
+    moved = {n: one for n, one in every.items() if one is not None}
+    diverged = tuple(n for n in every if n not in moved)
+    return Linear(point, composed.rows, residual, starts, moved, diverged, dropped, _rates(composed, base))
 
 
 def _rates(composed: Composed, base: Base) -> np.ndarray:
@@ -157,12 +148,18 @@ def vary(
         here = {**neutral, **at}
         rows = _rows_at(composed, base, starts, name, here)
         shift = rows - base.rows
-    sizes = np.full(len(effect.parameters), STEP) if step is None else step
-    columns = _each_log_at_once(composed, base, starts, name, here, rows, sizes) if effect.by_log else []
-    for short, size in () if effect.by_log else zip(effect.parameters, sizes, strict=True):
-        move = step_of(composed, name, short, here[short], size)
-        there = _rows_at(composed, base, starts, name, {**here, short: here[short] + move})
+    names, log, columns = [*effect.parameters], composed.rows.log, []
+    sizes = np.full(len(names), STEP) if step is None else step
+    # Logs do not act on each other: a parameter that each has of its own is varied in all of them at once.
+    # Such parameters are ordered by log, then by kind.
+    kinds = len(names) // len(composed.recordings) if effect.by_log else len(names)
+    for kind in range(kinds):
+        mine = names[kind::kinds]
+        move = step_of(composed, name, mine[0], here[mine[0]], sizes[kind::kinds].min())
+        there = _rows_at(composed, base, starts, name, {**here, **{n: here[n] + move for n in mine}})
         columns.append((there - rows) / move)
+    if effect.by_log:
+        columns = [np.where(log == i // kinds, columns[i % kinds], 0.0) for i in range(len(names))]
     jacobian = np.stack(columns, 1)
     fine = np.isfinite(base.rows)
     if not (_bounded(jacobian[fine]) and _bounded(shift[fine])):
@@ -180,7 +177,7 @@ def _bounded(values: np.ndarray) -> bool:
     return bool((np.abs(values) < HUGE).all())
 
 
-def wobbling(composed: Composed, linear: Linear) -> Composed:
+def with_wobble(composed: Composed, linear: Linear) -> Composed:
     """The model with the wobble of contacts by all effects that were linearised (see `Composed`)."""
     strikes = linear.rows.regime == REGIMES.index(STRIKES)
     if not (linear.starts and strikes.any() and linear.moved):
@@ -188,32 +185,6 @@ def wobbling(composed: Composed, linear: Linear) -> Composed:
     size = {n: np.array([p.sd for p in composed.effects[n].parameters.values()]) for n in linear.moved}
     columns = np.concatenate([m.jacobian * size[n] for n, m in linear.moved.items()], 1)
     return replace(composed, wobble=np.where(strikes[:, None] & np.isfinite(columns), columns, 0.0))
-
-
-def _each_log_at_once(
-    composed: Composed,
-    base: Base,
-    starts: Mapping[str, np.ndarray],
-    name: str,
-    here: Mapping[str, float],
-    rows: np.ndarray,
-    sizes: np.ndarray,
-) -> list[np.ndarray]:
-    """Derivatives (N,) by every parameter of an effect that each log has of its own.
-
-    Logs do not act on each other, so that a parameter is varied in all of them at once. Parameters are
-    ordered by log, then by kind.
-    """
-    names = list(composed.effects[name].parameters)
-    kinds = len(names) // len(composed.recordings)
-    found = []
-    for kind in range(kinds):
-        mine = names[kind::kinds]
-        step = step_of(composed, name, mine[0], here[mine[0]], sizes[kind::kinds].min())
-        there = _rows_at(composed, base, starts, name, {**here, **{n: here[n] + step for n in mine}})
-        found.append((there - rows) / step)
-    log = composed.rows.log
-    return [np.where(log == i // kinds, found[i % kinds], 0.0) for i in range(len(names))]
 
 
 def _rows_at(

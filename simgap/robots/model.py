@@ -29,18 +29,12 @@ class Composed:
     parameters: they are taken once, at the point `about`, and what would cost a second run (a finer step) is
     linear in its parameter.
 
-    Attributes:
-        simulator: The robot's model.
-        recordings: Its logs.
-        windows: Stretches of the logs, each simulated from its own start.
-        effects: Candidates and what is fitted along, by name.
-        noise: Standard deviation of one sample by channel [its unit].
-        rows: The rows that the windows give.
-        wobble: Change (N, K) of the rows by a usual size of every effect, in windows in which bodies move in
-            contact; None without such windows.
-        motion: A number for every log's motion, equal in repeats (see `motions`); empty where windows restart
-            from states of their own.
-        about: The point of those derivatives.
+    `simulator`: the robot's model; `recordings`: its logs; `windows`: stretches of the logs, each simulated
+    from its own start; `effects`: candidates and what is fitted along, by name; `noise`: standard deviation
+    of one sample by channel [its unit]; `rows`: the rows that the windows give; `wobble`: change (N, K) of
+    the rows by a usual size of every effect, in windows in which bodies move in contact; None without such
+    windows; `motion`: A number for every log's motion, equal in repeats (see `motions`); empty where windows
+    restart from states of their own; `about`: the point of those derivatives.
     """
 
     simulator: Simulator
@@ -179,7 +173,7 @@ class Composed:
         for window, start in zip(windows, starts, strict=True):
             along, lead = recordings[window.log].window(window.begin, window.end), 0
             if window.regime == RESTS:
-                along, lead = settled(along)
+                along, lead = preceded_by_rest(along)
             jobs.append(Job(parameters, along, start))
             leads.append(lead)
         return [
@@ -240,7 +234,7 @@ def _sum(one: Channels | None, other: Channels, by: float) -> Channels | None:
     return one if one is None or not other else {n: v + by * other[n] for n, v in one.items()}
 
 
-def settled(window: Recording) -> tuple[Recording, int]:
+def preceded_by_rest(window: Recording) -> tuple[Recording, int]:
     """Prepend SETTLE to a window, constant as at its first sample, so that the model comes to rest where it
     would rest itself.
 

@@ -25,14 +25,10 @@ RATE_LIMIT = 100.0  # chosen: Hz: samples are averaged down to this rate
 class Rows:
     """N rows, ordered by window, then time, then channel.
 
-    Attributes:
-        channels: Names of the compared channels.
-        log, channel, window, regime: Number (N,) of each row's log, channel, window and window's regime.
-        time: Times (N,) [s].
-        since: Times (N,) [s] since the window's first sample.
-        observed: Recorded values (N,) in the channel's unit.
-        variance: Variance (N,) of their sensor noise.
-        of: The rows of each window.
+    `channels`: names of the compared channels; `log`, `channel`, `window`, `regime`: number (N,) of each
+    row's log, channel, window and window's regime; `time`: times (N,) [s]; `since`: times (N,) [s] since the
+    window's first sample; `observed`: recorded values (N,) in the channel's unit; `variance`: variance (N,)
+    of their sensor noise; `of`: the rows of each window.
     """
 
     channels: tuple[str, ...]
@@ -152,7 +148,7 @@ def resolution(values: np.ndarray) -> float:
     return step if np.quantile(away, 0.95) < 0.05 else 0.0
 
 
-def learned(recordings: Sequence[Recording], name: str) -> float:
+def estimate_noise(recordings: Sequence[Recording], name: str) -> float:
     """Robust standard deviation of a channel's white noise from its differences.
 
     Motion only adds to differences, so the least over ORDERS counts: a second difference is blind to straight
@@ -169,7 +165,7 @@ def noises(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, f
         if channel.kind == "command":
             continue
         step = max(resolution(r[name]) for r in recordings)
-        stated = channel.noise if np.isfinite(channel.noise) else learned(recordings, name)
+        stated = channel.noise if np.isfinite(channel.noise) else estimate_noise(recordings, name)
         sd = max(stated, step / np.sqrt(12.0))
         out[name] = sd if sd > 0 else 1e-6 * max(1.0, float(np.nanstd(recordings[0][name])))
     return out

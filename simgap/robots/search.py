@@ -21,8 +21,8 @@ from scipy.stats import t as student
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration
-from simgap.robots.fit import moved_to, prior_cost
-from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, wobbling
+from simgap.robots.fit import fit_effects, prior_cost
+from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, with_wobble
 from simgap.robots.model import Composed, Point
 from simgap.robots.sets import (
     Identifiability,
@@ -58,21 +58,15 @@ MANY = 80  # numerics: candidates up to which all pairs are tried
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class FittedSet:
     """A set of effects at its best fit.
 
-    Attributes:
-        composed: The model, with the derivatives by the simulator's own numbers taken at the fit.
-        names: The set.
-        point: Its parameters, and those of what is fitted along.
-        linear: The gap linearised about the point, in the set's effects.
-        covariances: Of the rows.
-        discrepancy: What the set leaves beyond noise.
-        wide: Windows that are off for reasons of their own, with the factor of their variance.
-        whiten: By noise, discrepancy and wide windows.
-        sets: The closed form about the point.
-        score: Log evidence [nats].
-        promise: Log evidence [nats] that the closed form expects of a further step.
+    `composed`: the model, with the derivatives by the simulator's own numbers taken at the fit; `names`: the
+    set; `point`: its parameters, and those of what is fitted along; `linear`: the gap linearised about the
+    point, in the set's effects; `covariances`: of the rows; `discrepancy`: what the set leaves beyond noise;
+    `wide`: windows that are off for reasons of their own, with the factor of their variance; `whiten`: by
+    noise, discrepancy and wide windows; `sets`: the closed form about the point; `score`: log evidence
+    [nats]; `promise`: log evidence [nats] that the closed form expects of a further step.
     """
 
     composed: Composed
@@ -107,17 +101,12 @@ class Settled:
 class Search:
     """A search over sets of candidates.
 
-    Attributes:
-        composed: The model along the windows that are compared.
-        wanted: Names of the candidates.
-        fold: Fold (N,) of each row.
-        calibrated: Fits what nobody measured, from the model as it comes; called where a gap is left.
-        calibration: Its result.
-        known: All sets that were fitted, each at its best.
-        against: Joint candidates (see `_together`): how much of the second goes against one of the first.
-        columns: Candidates as they were rolled out where the search began; None of one that diverged.
-        identifiable: Which candidates' parameters the logs tell apart.
-        diverged: Candidates that diverge.
+    `composed`: the model along the windows that are compared; `wanted`: names of the candidates; `fold`: fold
+    (N,) of each row; `calibrated`: fits what nobody measured, from the model as it comes; called where a gap
+    is left; `calibration`: its result; `fitted`: all fitted sets, each at its best; `against`: joint
+    candidates (see `_joint`): how much of the second goes against one of the first; `columns`: candidates
+    as they were rolled out where the search began; None of one that diverged; `identifiable`: which
+    candidates' parameters the logs tell apart; `diverged`: candidates that diverge.
     """
 
     composed: Composed
@@ -125,13 +114,13 @@ class Search:
     fold: np.ndarray
     calibrated: Callable[[], Calibration | None] = lambda: None
     calibration: Calibration | None = None
-    known: dict[frozenset[str], Settled] = field(default_factory=dict)
+    fitted: dict[frozenset[str], FittedSet] = field(default_factory=dict)
     against: dict[str, float] = field(default_factory=dict)
     columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
     _starts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
-    _densities: dict[tuple[Settled, Whitener], np.ndarray] = field(default_factory=dict, repr=False)
+    _densities: dict[tuple[FittedSet, Whitener], np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def along(self) -> Names:
@@ -144,7 +133,7 @@ class Search:
         share = min(EXPECTED / max(len(self.wanted), 1), 0.5)
         return float(np.log(share / (1 - share)))
 
-    def run(self, tell: Progress) -> Settled:
+    def run(self, tell: Progress) -> FittedSet:
         """The best set, searched forwards from nothing and, where that leaves a gap, backwards from the
         calibration."""
         best = self._from(self.nothing(), tell)
@@ -152,43 +141,43 @@ class Search:
             return best
         tell("from the calibration")
         self.columns.clear()
-        other = self._calibrated()
+        other = self._from_calibration()
         if other is not None and other.squares.sum() < best.squares.sum():
             other = self._from(other, tell)
             best = other if self._is_better(other, best) else best
         return best
 
-    def forced(self, names: Names) -> Settled:
+    def forced(self, names: Names) -> FittedSet:
         """A given set at its best; all sets with one effect less are fitted, too."""
-        sets, levels = self.place(self.nothing(), self.wanted)
+        sets, levels = self.propose(self.nothing(), self.wanted)
         _, level, begin = self._likeliest(sets, names)
-        found = self.settled(names, begin, [levels[level]])
+        found = self.fit(names, begin, [levels[level]])
         for out in names if len(names) > 1 else ():
             rest = tuple(n for n in names if n != out)
-            self.settled(rest, without(found.point, out), [found.whiten])
+            self.fit(rest, without(found.point, out), [found.whiten])
         return found
 
-    def nothing(self) -> Settled:
+    def nothing(self) -> FittedSet:
         """The empty set: only what is fitted along."""
         point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
         if any(w.regime == STRIKES for w in self.composed.windows):
             every = linearise(self.composed, point, [*self.along, *self.wanted])
-            self.composed = wobbling(self.composed, every)
+            self.composed = with_wobble(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
         self._starts = dict(linear.starts)
-        return self.settled((), point, [covariances(self.composed, linear).whitener()])
+        return self.fit((), point, [covariances(self.composed, linear).whitener()])
 
-    def _from(self, best: Settled, tell: Progress) -> Settled:
+    def _from(self, best: FittedSet, tell: Progress) -> FittedSet:
         """The best set that steps lead to."""
         for number in range(ROUNDS):
             tell(f"round {number + 1}: {' + '.join(best.names) or 'nothing'}")
-            better = self._better(best, best) or self._exchanged(best)
+            better = self._find_better(best, best) or self._exchange(best)
             if better is None:
                 break
             best = better if number else self._from_other_ends(better)
         return best
 
-    def _from_other_ends(self, best: Settled) -> Settled:
+    def _from_other_ends(self, best: FittedSet) -> FittedSet:
         """The same set from the other end of how the simulator takes its commands, where that promises more.
 
         Commands held in steps are nearly commands in lines that come later, and no small step leads from one
@@ -202,13 +191,13 @@ class Search:
                     other = {**best.point[name], short: p.high if near_low else p.low}
                     point = {**best.point, name: other}
                     there = replace(best, composed=best.composed.moved(point), point=point)
-                    sets, levels = self.place(there, best.names)
+                    sets, levels = self.propose(there, best.names)
                     score, k, begin = self._likeliest(sets, best.names)
                     if score > best.score + NEAR:
-                        best = self.settled(best.names, begin, [levels[k]], best.score)
+                        best = self.fit(best.names, begin, [levels[k]], best.score)
         return best
 
-    def _calibrated(self) -> Settled | None:
+    def _from_calibration(self) -> FittedSet | None:
         """The set of what calibration moved, less what it can do without in closed form."""
         self.calibration = self.calibrated()
         calibrated = {} if self.calibration is None else self.calibration.point
@@ -217,10 +206,10 @@ class Search:
             return None
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
-        whole = self.settled(names, begin, [self.known[frozenset()].covariances.whitener()])
-        sets, _ = self.place(whole, names)
+        whole = self.fit(names, begin, [self.fitted[frozenset()].covariances.whitener()])
+        sets, _ = self.propose(whole, names)
         names = sets.pruned(names, self._likeliest(sets, names)[1])
-        return self.settled(names, self._likeliest(sets, names)[2], [whole.whiten])
+        return self.fit(names, self._likeliest(sets, names)[2], [whole.whiten])
 
     def _is_moved(self, name: str, values: Mapping[str, float]) -> bool:
         parameters = self.composed.effects[name].parameters
@@ -231,9 +220,9 @@ class Search:
         score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(sets.gram)))
         return score, level, point_of(self.composed.effects, sets.fit(names, level), names, self.along)
 
-    def settled(
+    def fit(
         self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
-    ) -> Settled:
+    ) -> FittedSet:
         """Fit a set exactly, and remember it at its best.
 
         Args:
@@ -247,13 +236,13 @@ class Search:
         say(f"fitting {' + '.join(names) or 'nothing'}")
         here, best, key = self.composed.moved(begin), None, frozenset(names)
         for whiten in scales:
-            one = self._judged(here, names, self._moved(here, begin, whiten))
+            one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
                 before = one.score
                 if one.promise < max(before + BETTER, rival - NEAR):
                     break
                 there = self.composed.moved(one.point)
-                again = self._judged(there, names, self._moved(there, one.point, one.whiten))
+                again = self._judge(there, names, self._fit_point(there, one.point, one.whiten))
                 one = max((one, again), key=lambda fitted: fitted.score)
                 if one.score < before + BETTER:
                     break
@@ -261,23 +250,23 @@ class Search:
             if best.score >= rival - NEAR:
                 break
         assert best is not None
-        if key not in self.known or self.known[key].score < best.score:
-            self.known[key] = best
-        return self.known[key]
+        if key not in self.fitted or self.fitted[key].score < best.score:
+            self.fitted[key] = best
+        return self.fitted[key]
 
-    def _moved(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
+    def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
         linear = linearise(composed, begin, [], self._starts)
-        return moved_to(composed, linear, whiten, begin)
+        return fit_effects(composed, linear, whiten, begin)
 
-    def _judged(self, composed: Composed, names: Names, point: Point) -> Settled:
+    def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's)."""
         linear = linearise(composed, point, [*self.along, *names], self._starts)
         cov = covariances(composed, linear)
         left = np.nan_to_num(linear.residual)
-        discrepancy = cov.learned(left)
+        discrepancy = cov.estimate(left)
         whiten = cov.whitener(discrepancy)
-        if wide := cov.off_alone(whiten, left):
-            discrepancy = cov.learned(left, wide)
+        if wide := cov.outliers(whiten, left):
+            discrepancy = cov.estimate(left, wide)
             whiten = cov.whitener(discrepancy, wide)
         sets = self._sets(linear, [whiten], names)
         score = promise = -np.inf
@@ -292,7 +281,7 @@ class Search:
             score += 0.5 * float(np.linalg.slogdet(fit.covariance[np.ix_(inside, inside)])[1])
             score += _prior_constants(sets.size)
             score += len(wide) * ALONE - 1e3 * linear.dropped
-        return Settled(composed, names, point, linear, cov, discrepancy, wide, whiten, sets, score, promise)
+        return FittedSet(composed, names, point, linear, cov, discrepancy, wide, whiten, sets, score, promise)
 
     def _sets(
         self,
@@ -306,7 +295,7 @@ class Search:
         usable = [n for n in names if n in linear.moved]
         return Sets.of(effects, linear, levels, usable, self.fold, self.log_odds)
 
-    def place(self, at: Settled, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
+    def propose(self, at: FittedSet, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
         """Candidates about the point of a set, in closed form with its discrepancy and with less of it.
 
         Candidates that do not act yet are varied by their usual size, for a joint that sticks follows no
@@ -331,11 +320,11 @@ class Search:
         if not held:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
-        linear = self._where_they_act(composed, base, linear, sets, held)
-        linear, joint = self._together(composed, base, linear, sets, held)
+        linear = self._roll_out_leaders(composed, base, linear, sets, held)
+        linear, joint = self._joint(composed, base, linear, sets, held)
         return self._sets(linear, levels, [*names, *joint], joint), levels
 
-    def _together(
+    def _joint(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
     ) -> tuple[Linear, dict[str, RobotEffect]]:
         """Joint candidates of an encoder's misreading and its servo's command offset that nearly cancel.
@@ -377,7 +366,7 @@ class Search:
                 return Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
         return None
 
-    def _where_they_act(
+    def _roll_out_leaders(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
     ) -> Linear:
         """The leading candidates rolled out where they fit best: what kinks or saturates is a straight line
@@ -406,12 +395,12 @@ class Search:
                 more[name] = one
         return linear.with_moved(more)
 
-    def _better(self, at: Settled, best: Settled) -> Settled | None:
+    def _find_better(self, at: FittedSet, best: FittedSet) -> FittedSet | None:
         """A set that beats the best after an exact fit, proposed about the point of `at`.
 
         `at` is the best itself, or the best less one cause, whose replacements are then sought.
         """
-        sets, levels = self.place(at, self.wanted)
+        sets, levels = self.propose(at, self.wanted)
         names = [n for n in sets.names if n not in self.against]
         near = neighbours(at.names, sets.names)
         if at is best and len(names) <= MANY:  # a replacement is a single effect
@@ -428,14 +417,15 @@ class Search:
         effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
         tried, wrong, found = 0, 0.0, best
         for k in np.argsort(-promised):
-            if tried >= TRIED or promised[k] < least:
+            # Two replacements are fitted whatever straight lines promise: these may miss them by more.
+            if tried >= TRIED or (promised[k] < least and (at is best or tried >= LEARNED)):
                 break
             begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
-            names = self._apart(near[k], begin)
-            if frozenset(names) in self.known or (at is not best and {*best.names} < {*names}):
+            names = self._take_apart(near[k], begin)
+            if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                 continue
             scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
-            one, tried = self.settled(names, begin, scales, best.score), tried + 1
+            one, tried = self.fit(names, begin, scales, best.score), tried + 1
             wrong = max(wrong, one.score - best.score - promised[k])
             if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
                 least = max(least, -NEAR - wrong)
@@ -445,7 +435,7 @@ class Search:
                     break
         return None if found is best else found
 
-    def gains(self, one: Settled, other: Settled, by: Settled) -> np.ndarray:
+    def gains(self, one: FittedSet, other: FittedSet, by: FittedSet) -> np.ndarray:
         """Log densities (folds,) of each fold given the others, of one set over another.
 
         Both are whitened with the discrepancy of `by`: its size differs between motions, so that a set which
@@ -454,19 +444,19 @@ class Search:
         mine, theirs = (self._held_out(s, by.whiten) for s in (one, other))
         return mine - theirs
 
-    def _held_out(self, one: Settled, whiten: Whitener) -> np.ndarray:
+    def _held_out(self, one: FittedSet, whiten: Whitener) -> np.ndarray:
         if (one, whiten) not in self._densities:
             sets = self._sets(one.linear, [whiten], one.names)
             self._densities[one, whiten] = sets.held_out(one.names, 0)
         return self._densities[one, whiten]
 
-    def _is_better(self, one: Settled, best: Settled) -> bool:
+    def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
         """Whether to go on from a set: it is likelier, and drops causes or predicts held-out logs better."""
         if one.score <= best.score + BETTER:
             return False
         return {*one.names} < {*best.names} or predicts_better(self.gains(one, best, best))
 
-    def _apart(self, names: Names, point: dict) -> Names:
+    def _take_apart(self, names: Names, point: dict) -> Names:
         """The set with joint candidates taken apart, and its point likewise, in place."""
         out: list[str] = []
         for name in names:
@@ -480,14 +470,12 @@ class Search:
                 out.append(one)
         return tuple(dict.fromkeys(out))
 
-    def _exchanged(self, best: Settled) -> Settled | None:
+    def _exchange(self, best: FittedSet) -> FittedSet | None:
         """A better set without one of the best's causes, or with replacements for one."""
         for out in best.names:
             rest = tuple(n for n in best.names if n != out)
-            less = self.known.get(frozenset(rest)) or self.settled(
-                rest, without(best.point, out), [best.whiten]
-            )
-            there = less if self._is_better(less, best) else self._better(less, best)
+            less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), [best.whiten])
+            there = less if self._is_better(less, best) else self._find_better(less, best)
             if there is not None:
                 return there
         return None

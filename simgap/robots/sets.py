@@ -2,13 +2,14 @@
 
 There the rows are linear in all parameters, x in prior standard deviations from neutral:
 
-    residual = sum over what is fitted along, N(0, 1), and over the set's effects, each a Cauchy slab,
-               of columns x  +  noise N(0, V),      V = V_0 + level^2 (discrepancy as it is at the point).
+    residual = columns x + noise N(0, V),      V = V_0 + level^2 (discrepancy as it is at the point),
 
-A set's log evidence is Laplace's about its mode. Which discrepancy a set leaves is known once it is fitted:
-so there are several levels of it, of each the normal equations of all columns by fold, and a set has that
-which it is likeliest by. The log density of a fold given the others is the evidence of all less that of the
-others.
+with priors N(0, 1) of what is fitted along and Cauchy slabs of the set's effects.
+
+A set's log evidence is Laplace's about its mode. The discrepancy that a set leaves is known only once it is
+fitted, so there are several levels of it, each with the normal equations of all columns by fold, and a set is
+scored with the likeliest. The log density of a fold given the others is the evidence of all folds less that
+of the others.
 """
 
 from __future__ import annotations
@@ -27,18 +28,21 @@ from simgap.robots.linear import Linear, Moved
 from simgap.robots.model import Point
 from simgap.robots.whiten import Whitener
 
-TURNS = 6  # numerics: of reweighted least squares
-ALIKE, SAME = 0.7, 0.99999  # numerics: correlations of columns that nearly cancel, and that are one
-SEEN = 1.0  # numerics: noise deviations that a usual size moves all rows by, together
+TURNS = 6  # numerics: iterations of reweighted least squares
+ALIKE, SAME = 0.7, 0.99999  # numerics: correlations of columns that nearly cancel, and of equal ones
+SEEN = 1.0  # numerics: noise deviations by which a usual size must move all rows, together
 
 Names = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of a set by one level: its log evidence, the mode x (m,) of what is fitted along and of its effects'
-    parameters, the covariance (m, m) there, 0 of what is at a bound, and the `spread` (m, m): that of as
-    much without bounds, for what lies at one is not certain, nor is what it is traded against."""
+    """A set's evidence with one level of the discrepancy.
+
+    `score`: log evidence [nats]; `x`: mode (m,) of what is fitted along, then of the set's parameters;
+    `covariance`: there (m, m); 0 of what is at a bound; `spread`: the same without bounds (m, m): what lies
+    at a bound is not certain, nor is what it is traded against.
+    """
 
     score: float
     x: np.ndarray
@@ -48,9 +52,16 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Sets:
-    """Normal equations of all columns about a point, `gram` (levels, folds, M, M) with half the log
-    determinants (levels, folds). The first column is what is left with every effect neutral, then come those
-    that are fitted along, then of each candidate in `names` a constant and its derivatives."""
+    """Normal equations of all columns about a point.
+
+    The first column is the residual with every effect neutral; then come those that are fitted along, then
+    for each candidate a constant and its derivatives.
+
+    `names`: the candidates; `gram`: products of columns (levels, folds, M, M); `half_log_det`: half log
+    determinants of the noise (levels, folds); `along`: number of columns that are fitted along; `size`:
+    number of parameters of each candidate; `labels`: names of all their parameters; `low`, `high`: bounds
+    (M,) by column; `log_odds`: prior log odds of a candidate to act.
+    """
 
     names: Names
     gram: np.ndarray
@@ -72,26 +83,32 @@ class Sets:
         fold: np.ndarray,
         log_odds: float,
     ) -> Sets:
-        """About the point of a linear model that has these candidates and what is fitted along; `fold`
-        (N,)."""
+        """The normal equations about the point of a linearisation.
+
+        Args:
+            effects: By name; those that are `fitted` are fitted along.
+            linear: The linearisation, which has these candidates and what is fitted along.
+            levels: Whiteners, one for each level of the discrepancy.
+            names: The candidates.
+            fold: Fold (N,) of each row.
+            log_odds: Prior log odds of a candidate to act.
+        """
         seen = np.isfinite(linear.residual)
         along = [n for n, e in effects.items() if e.fitted]
-        columns, low, high = [np.nan_to_num(linear.residual)], [0.0], [0.0]
+        columns, bounds = [np.nan_to_num(linear.residual)], [(0.0, 0.0)]
         for name in along:
             moved, known = linear.moved[name], list(effects[name].parameters.values())
             for k, p in enumerate(known):
                 columns.append(np.nan_to_num(moved.jacobian[:, k]) * p.sd)
                 columns[0] = columns[0] + columns[-1] * (moved.at[k] - p.nominal) / p.sd
-                low.append((p.low - p.nominal) / p.sd)
-                high.append((p.high - p.nominal) / p.sd)
+                bounds.append((p.coordinate(p.low), p.coordinate(p.high)))
         width = len(columns) - 1
         for name in names:
-            mine, bounds = _columns(effects[name], linear.moved[name])
             if name in linear.point:
                 columns[0] = columns[0] + np.nan_to_num(linear.moved[name].shift)
-            columns += mine
-            low += [0.0, *bounds[0]]
-            high += [0.0, *bounds[1]]
+            columns += _columns(effects[name], linear.moved[name])
+            known = effects[name].parameters.values()
+            bounds += [(0.0, 0.0), *((p.coordinate(p.low), p.coordinate(p.high)) for p in known)]
         whole, numbers = np.where(seen[:, None], np.column_stack(columns), 0.0), np.unique(fold)
         gram, half = [], []
         for whiten in levels:
@@ -101,11 +118,11 @@ class Sets:
             half.append(whiten.half_log_dets(np.searchsorted(numbers, fold)))
         size = tuple(len(effects[n].parameters) for n in names)
         labels = tuple(effects[n].label(short) for n in names for short in effects[n].parameters)
-        bounds = np.array(low), np.array(high)
-        return cls(tuple(names), np.array(gram), np.array(half), width, size, labels, *bounds, log_odds)
+        low, high = np.array(bounds).T
+        return cls(tuple(names), np.array(gram), np.array(half), width, size, labels, low, high, log_odds)
 
     def scores(self, sets: Sequence[Names], level: int, without: int | None = None) -> np.ndarray:
-        """Log evidence of sets (len(sets),) by a level, `without` one fold."""
+        """Log evidence (len(sets),) of sets with a level, `without` one fold."""
         alike: dict[tuple[int, ...], list[int]] = defaultdict(list)
         for i, names in enumerate(sets):
             alike[tuple(sorted(self._size(n) for n in names))].append(i)
@@ -116,13 +133,12 @@ class Sets:
         return out
 
     def fit(self, names: Names, level: int) -> Evidence:
-        """One set's evidence by a level; parameters in the order of `names`."""
+        """A set's evidence with a level; parameters in the order of `names`."""
         score, x, covariance, spread = self._evidence([names], level, None, kept=True)
         return Evidence(float(score[0]), x[0], covariance[0], spread[0])
 
     def pruned(self, names: Names, level: int) -> Names:
-        """What is left of a set when the one that it needs least is taken out again and again, as long as
-        that makes it likelier."""
+        """The set less the effects needed least, dropped one by one while that makes it likelier."""
         score = float(self.scores([names], level)[0])
         while names:
             fewer = [tuple(n for n in names if n != out) for out in names]
@@ -143,8 +159,8 @@ class Sets:
         return np.array([self._evidence([names], level, k, kept=True)[1][0] for k in folds])
 
     def product(self) -> tuple[list[str], np.ndarray]:
-        """Candidates' parameters by name, and inner products (p, p) of their columns by the sensors'
-        noise."""
+        """Names of the candidates' parameters, and inner products (p, p) of their columns, whitened by the
+        sensors' noise."""
         at = [self.first[j] + 1 + k for j, size in enumerate(self.size) for k in range(size)]
         return list(self.labels), self.gram[-1].sum(0)[np.ix_(at, at)]
 
@@ -159,8 +175,8 @@ class Sets:
     def _evidence(
         self, sets: Sequence[Names], level: int, without: int | None, kept: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Scores (B,), modes (B, m), covariances and spreads (B, m, m) of sets whose effects have as many
-        parameters."""
+        """Scores (B,), modes (B, m), covariances and spreads (B, m, m) of sets whose effects have equally
+        many parameters."""
         used = np.arange(self.gram.shape[1]) != without
         gram, half = self.gram[level][used].sum(0), float(self.half_log_det[level][used].sum())
         place = {n: self.first[j] for j, n in enumerate(self.names)}
@@ -210,18 +226,16 @@ class Sets:
         return score, x, np.linalg.inv(matrix) * loose, spread
 
 
-def _columns(effect: RobotEffect, moved: Moved) -> tuple[list[np.ndarray], tuple[list[float], list[float]]]:
-    """A candidate's constant part and derivatives by usual sizes, and their bounds in these."""
+def _columns(effect: RobotEffect, moved: Moved) -> list[np.ndarray]:
+    """A candidate's constant and its derivatives by usual sizes."""
     known = list(effect.parameters.values())
     sd, neutral = np.array([p.sd for p in known]), np.array([p.nominal for p in known])
     slope = np.nan_to_num(moved.jacobian) * sd
-    constant = np.nan_to_num(moved.shift) - slope @ ((moved.at - neutral) / sd)
-    bounds = [(p.low - p.nominal) / p.sd for p in known], [(p.high - p.nominal) / p.sd for p in known]
-    return [constant, *slope.T], bounds
+    return [np.nan_to_num(moved.shift) - slope @ ((moved.at - neutral) / sd), *slope.T]
 
 
 def neighbours(best: Names, names: Sequence[str]) -> list[Names]:
-    """Sets with one effect more, one left out, or one exchanged."""
+    """Sets with one effect more, one less, or one exchanged."""
     fewer = [tuple(n for n in best if n != out) for out in best]
     more = [(*kept, n) for kept in (best, *fewer) for n in names if n not in best]
     return [*more, *fewer]
@@ -250,13 +264,16 @@ def point_of(
 
 
 def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
-    """A point with one effect neutral."""
+    """A point without one effect."""
     return {n: v for n, v in point.items() if n != out}
 
 
 def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str, str, float]]:
-    """Pairs of a read-out's and a command's effect, of one parameter each, whose columns nearly cancel, and
-    how much of the second, in usual sizes, goes against one of the first."""
+    """Pairs of a read-out and a command effect, of one parameter each, whose columns nearly cancel.
+
+    Returns:
+        Both names, and how many usual sizes of the second cancel one of the first.
+    """
     single = [j for j, k in enumerate(sets.size) if k == 1]
     at = np.array([sets.first[j] + 1 for j in single], int)
     product = sets.gram[-1].sum(0)[np.ix_(at, at)]
@@ -272,36 +289,37 @@ def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str
     return found
 
 
-# Which parameters these logs can tell, and which only together: read off sensitivities before any fit.
+# Identifiability: which parameters these logs determine, and which only jointly.
 
 
-UNSEEN = 1.0  # chosen: noise deviations: what a parameter's usual size must move all samples by, together
-EXACT, CLOSE = 1e-6, 0.02  # chosen: share of a parameter's sensitivity that is its own, at most
-LARGEST = 6  # numerics: parameters of a set
+UNSEEN = 1.0  # chosen: noise deviations by which a parameter's usual size must move all samples, together
+EXACT, CLOSE = 1e-6, 0.02  # chosen: shares of a sensitivity that no others reproduce, at most
+LARGEST = 6  # numerics: most parameters of a set
 
 
 @dataclass(frozen=True)
 class Alike:
-    """Parameters of which only a combination is determined; `own`: the share that the first has to itself."""
+    """Parameters of which only a combination is determined; `own`: the share of its sensitivity that only the
+    first has."""
 
     names: tuple[str, ...]
     own: float
 
     @property
     def exact(self) -> bool:
-        """Whether they cannot be told apart by any amount of such data."""
+        """Whether no amount of such data tells them apart."""
         return self.own <= EXACT
 
 
 @dataclass(frozen=True)
 class Identifiability:
-    """`unseen` parameters move nothing by more than noise; `alike` are sets that act alike."""
+    """Parameters that are `unseen`, moving nothing beyond noise, and sets of parameters that act `alike`."""
 
     unseen: tuple[str, ...]
     alike: tuple[Alike, ...]
 
     def body(self) -> dict:
-        """As the JSON document has it."""
+        """The entry of the JSON document."""
         return {
             "unseen": list(self.unseen),
             "alike": [{"parameters": list(a.names), "own": a.own, "exact": a.exact} for a in self.alike],
@@ -309,10 +327,14 @@ class Identifiability:
 
 
 def identifiability(names: Sequence[str], product: np.ndarray) -> Identifiability:
-    """From inner products (p, p) of sensitivities, whitened, each for a change of one usual size.
+    """Which parameters the logs determine, and which only jointly, from sensitivities at one point.
 
-    A parameter is alike the fewest others that make up its sensitivity, found one by one (orthogonal
+    A parameter is alike the fewest others that reproduce its sensitivity, found one by one (orthogonal
     matching pursuit: Pati, Rezaiifar and Krishnaprasad 1993).
+
+    Args:
+        names: Names of p parameters.
+        product: Inner products (p, p) of whitened sensitivities to changes of one usual size.
     """
     length = np.sqrt(np.diag(product))
     unseen = length < UNSEEN
@@ -334,13 +356,13 @@ def identifiability(names: Sequence[str], product: np.ndarray) -> Identifiabilit
 
 
 def _makers(gram: np.ndarray, j: int) -> tuple[list[int], float]:
-    """The fewest other columns that make up column j, and the share of its square that they leave.
+    """The fewest other columns that reproduce column j, and the share of its square that they leave.
 
-    A set that makes it up exactly goes before a smaller one that does so closely.
+    A set that reproduces it exactly goes before a smaller one that does so closely.
     """
     chosen: list[int] = []
     close: tuple[list[int], float] = ([], 1.0)
-    left = gram[:, j].copy()  # of column j, what is left along every column
+    left = gram[:, j].copy()  # what is left of column j along every column
     for _ in range(min(LARGEST - 1, len(gram) - 1)):
         left[[j, *chosen]] = 0.0
         chosen.append(int(np.abs(left).argmax()))

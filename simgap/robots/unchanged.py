@@ -1,11 +1,10 @@
-"""What is known of a robot that did not change, from logs of it run freely.
+"""An unchanged robot: what logs of it, run freely, tell of its parameters and of what the model gets wrong.
 
-See `simgap.robots.changes` for the model. A sample that jumps away from both neighbours and back is no
-reading and left out. Rows are recorded less simulated values in units of their channel's scale, less what the
-uncertain start of their log makes of them. What a model leaves has long tails (a command that comes late, an
-arm that sticks), so rows are Student-t (Lange, Little & Taylor, Journal of the American Statistical
-Association 84, 1989). They are far from independent: what is sure is judged between motions, never by the
-number of rows.
+See `simgap.robots.changes` for the model. Rows are recorded less simulated values in units of their channel's
+scale, less what the uncertain start of their log explains. What a model leaves has long tails (a command that
+comes late, an arm that sticks), so rows are Student-t (Lange, Little & Taylor, Journal of the American
+Statistical Association 84, 1989). They are far from independent: certainty is judged between motions, never
+by the number of rows. A sample that jumps away from both neighbours and back is no reading and is left out.
 """
 
 from __future__ import annotations
@@ -18,25 +17,25 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.robust import robust_sd
 from simgap.robots.calibrate import Calibration, without_starts
-from simgap.robots.fit import Cost, Local, descended
+from simgap.robots.fit import Cost, Local, minimise
 from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed, Point, motions
 from simgap.robots.rows import resolution
 from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
-BROKEN = 10.0  # chosen: of what 5 % of samples leave the mean of their neighbours by, a sample that is broken
-TAILS = 4.0  # cited: degrees of freedom of what a model leaves, as Lange et al. fix them
-UNITS = 4  # numerics: motions, below which each is cut into stretches
-POSITIVE = 0.3  # numerics: of its sd, above which a parameter that cannot be negative is varied by factors
-STEP = 0.02  # numerics: of a finite difference
-FAR = 1.0  # numerics: coordinates: how far a step of a fit goes at most
-ROUNDS = 2  # numerics: fits to OLD, each with the scales and the dependence that the last one left
+BROKEN = 10.0  # chosen: times the distance from the neighbours' mean that 5 % of samples exceed
+TAILS = 4.0  # cited: degrees of freedom of what a model leaves (Lange et al.)
+UNITS = 4  # numerics: motions; fewer are cut into stretches
+POSITIVE = 0.3  # numerics: sds above which a parameter that cannot be negative is varied by factors
+STEP = 0.02  # numerics: coordinates: a finite difference
+FAR = 1.0  # numerics: coordinates: the longest step of a fit
+ROUNDS = 2  # numerics: fits to OLD, each with the scales and dependence of the last one
 
 
 @dataclass(frozen=True)
 class Broken:
-    """A sample that no robot can have made: `value` of a channel of a log at `time` [s], left out."""
+    """A sample that no robot can have made, left out: `value` of a log's channel at `time` [s]."""
 
     log: str
     channel: str
@@ -47,7 +46,7 @@ class Broken:
 def without_broken(
     simulator: Simulator, recordings: Sequence[Recording]
 ) -> tuple[list[Recording], list[Broken]]:
-    """The recordings with samples left out that jump away from both neighbours and back at once."""
+    """The recordings without samples that jump away from both neighbours and back at once."""
     out, found = [], []
     for log in recordings:
         columns = {}
@@ -75,8 +74,12 @@ def without_broken(
 
 @dataclass(frozen=True)
 class Coordinates:
-    """How parameters of effects are varied: `names` (effect, short), `at` (k,) their values at 0, `scale`
-    (k,), `log` (k,) whether by factors, bounds."""
+    """Coordinates of effects' parameters about a point.
+
+    `names`: effect and parameter; `at`: values (k,) at coordinates 0; `scale`: values per coordinate (k,), of
+    those not varied by factors; `log`: whether a parameter is varied by factors (k,); `low`, `high`: bounds
+    (k,).
+    """
 
     names: tuple[tuple[str, str], ...]
     at: np.ndarray
@@ -113,11 +116,10 @@ class Coordinates:
 
 
 class Runs:
-    """Logs run freely about a model: standardised rows, their derivatives, and how units of logs tell of
-    parameters.
+    """Logs run freely: standardised rows, their derivatives, and what each unit of the logs tells.
 
-    `unit` (N,): the motion that a row's log makes, or a stretch of it; units with the same number make the
-    same motion in other logs too.
+    A unit is a motion or a stretch of it: `unit` (N,) of each row. Units of equal number make the same
+    motion, in other logs too.
     """
 
     def __init__(
@@ -128,15 +130,15 @@ class Runs:
         if not np.isfinite(self.linear.residual).all():
             raise InputError("simulator", "does not follow a whole log", "a model that stays finite")
         self.units = np.unique(unit)
-        self.scaled(self._scales() if scale is None else scale)
+        self.set_scales(self._scales() if scale is None else scale)
 
-    def scaled(self, scale: np.ndarray) -> None:
-        """Use these scales by channel (C,); starts are taken off in their units."""
+    def set_scales(self, scale: np.ndarray) -> None:
+        """Use these scales by channel (C,)."""
         self.scale = scale
         self.standard = without_starts(self.composed, self.linear, scale[self.composed.rows.channel])
 
     def _scales(self, values: np.ndarray | None = None) -> np.ndarray:
-        """Student's scale of every channel (C,), by expectation and maximisation."""
+        """Student's scale of every channel (C,), by expectation-maximisation."""
         rows = self.composed.rows
         left = self.linear.residual if values is None else values
         out = np.ones(len(rows.channels))
@@ -149,19 +151,25 @@ class Runs:
             out[c] = np.sqrt(s2)
         return out
 
-    def rescaled(self, point: Point) -> None:
-        """Learn scales from what the model leaves at a point."""
-        self.scaled(self._scales(self.rows(point) * self.scale[self.composed.rows.channel]))
+    def rescale(self, point: Point) -> None:
+        """Re-estimate the scales from what the model leaves at a point."""
+        self.set_scales(self._scales(self.rows(point) * self.scale[self.composed.rows.channel]))
 
     def rows(self, point: Point) -> np.ndarray:
-        """Recorded less simulated, standardised (N,); not finite where a run diverged."""
+        """Recorded less simulated values, standardised (N,); not finite where a run diverged."""
         return self.standard(self.composed.rows.observed - base_at(self.composed, point).rows)
 
     def slopes(
         self, point: Point, of: Coordinates, x: np.ndarray, only: Collection[str] | None = None
     ) -> np.ndarray:
-        """Derivatives (N, k) of what is simulated, standardised, at a point that has coordinates x; 0 for all
-        but some effects, where these are named."""
+        """Derivatives (N, k) of simulated values by coordinates, standardised.
+
+        Args:
+            point: The point.
+            of: Coordinates.
+            x: The point's coordinates (k,).
+            only: Effects whose derivatives are wanted, the others' being 0; all by default.
+        """
         base, out = base_at(self.composed, point), np.zeros((self.log.size, len(of.names)))
         sizes = of.slopes(x)
         for effect in dict.fromkeys(e for e, _ in of.names if only is None or e in only):
@@ -173,8 +181,8 @@ class Runs:
                 out[:, mine] = np.nan_to_num(one.jacobian) * sizes[mine]
         return self.standard(out)
 
-    def told(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By unit the information (M, q, q) of columns' coordinates and the pull (M, q) on them."""
+    def information(self, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By unit the information (M, q, q) on the columns' coordinates and minus the gradient (M, q)."""
         heavy = weights(rows)
         each = [self.unit == u for u in self.units]
         return (
@@ -183,36 +191,39 @@ class Runs:
         )
 
     def losses(self, point: Point, number: int) -> tuple[float, float]:
-        """The summed loss of all rows but a unit's, and the mean of that unit's, at a point [nats]; those of
-        a model that diverges are large."""
+        """The loss at a point, summed over all rows but a unit's, and that unit's mean [nats]; large where a
+        run diverges."""
         each = loss(np.nan_to_num(self.rows(point), nan=1e6, posinf=1e6, neginf=-1e6))
         mine = self.unit == self.units[number] if number >= 0 else np.zeros(each.size, bool)
         return float(each[~mine].sum()), float(each[mine].mean()) if mine.any() else np.nan
 
 
 def weights(rows: np.ndarray) -> np.ndarray:
-    """Of standardised rows in a step of least squares."""
+    """Weights (n,) of standardised rows in a step of least squares."""
     return (TAILS + 1) / (TAILS + rows**2)
 
 
 def loss(rows: np.ndarray) -> np.ndarray:
-    """Minus the log likelihood of standardised rows, but for a constant."""
+    """Minus the log likelihood (n,) of standardised rows, up to a constant."""
     return (TAILS + 1) / 2 * np.log1p(rows**2 / TAILS)
 
 
-def halved(cost: Cost, x: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Where a step leads that straight lines took too far: it is halved until it costs least."""
+def best_of_halves(cost: Cost, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """The best of a step and its halves, as straight lines may take it too far."""
     tried = [x + part * np.clip(step, -FAR, FAR) for part in (1.0, 0.5, 0.25, 0.125)]
     return min(tried, key=cost)
 
 
 @dataclass(frozen=True)
 class Old:
-    """What is known of a robot that did not change: its `point`, coordinates `theta` (p) about it of what is
-    fitted, by unit the information (M, p, p) and pull (M, p) on them, their `prior` (p, p), `dependence`: as
-    how many rows that depend on each other one counts (units' pulls scatter so much more than those of
-    independent rows would, and the prior has so much more weight), how logs of a unit that took no part are
-    `missed` (M,) [nats a row], and the channels' `scale` (C,)."""
+    """What is known of the unchanged robot.
+
+    `point`: its parameters; `theta`: coordinates about it of the p fitted parameters; `units`: the M units of
+    its logs; `information`, `pull`: on `theta` by unit (M, p, p), (M, p); `prior`: curvature of the prior (p,
+    p), weighted like the rows; `dependence`: the number of dependent rows that count as one: units' pulls
+    scatter so much more than those of independent rows would; `missed`: loss (M,) of units that took no part
+    [nats a row]; `scale`: the channels' scales (C,).
+    """
 
     point: Point
     theta: Coordinates
@@ -226,13 +237,20 @@ class Old:
 
     @property
     def bend(self) -> np.ndarray:
-        """The curvature (p, p) of what OLD and the prior say of theta."""
+        """The curvature (p, p) of what OLD's logs and the prior say of `theta`."""
         return self.information.sum(0) + self.prior
 
 
-def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarray) -> Old:
-    """What OLD logs tell of a robot that does not change, from the point of its calibration. The prior counts
-    `dependence` times, as rows do not count singly."""
+def fit_old(composed: Composed, calibration: Calibration | None, unit: np.ndarray) -> Old:
+    """Fit OLD logs of an unchanged robot, starting from its calibration.
+
+    The prior is weighted by `dependence`, as rows do not count singly.
+
+    Args:
+        composed: The model along the logs.
+        calibration: On the same logs; None where nothing is fitted.
+        unit: Unit (N,) of each row.
+    """
     point: Point = {} if calibration is None else {n: dict(v) for n, v in calibration.point.items()}
     fitted = [e for e in point if not composed.effects[e].numeric]
     runs = Runs(composed, point, unit)
@@ -241,7 +259,7 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
     p, m, dependence = len(known), len(runs.units), 1.0
 
     def prior(z: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        """Minus its log at coordinates, its curvature (p, p) and pull (p,)."""
+        """Minus the log prior at coordinates, its curvature (p, p), and minus its gradient (p,)."""
         off, slope = (theta.values(z) - nominal) / sd, theta.slopes(z) / sd
         return 0.5 * dependence * float(off @ off), dependence * np.diag(slope**2), -dependence * slope * off
 
@@ -251,7 +269,7 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
 
     def told(z: np.ndarray) -> Local:  # by unit
         there = theta.point(point, z)
-        return runs.told(runs.rows(there), runs.slopes(there, theta, z))
+        return runs.information(runs.rows(there), runs.slopes(there, theta, z))
 
     def local(z: np.ndarray) -> Local:
         (information, pull), (_, bend, push) = told(z), prior(z)
@@ -259,10 +277,10 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
 
     none = np.zeros(p)
     for _ in range(ROUNDS):
-        runs.rescaled(point)
+        runs.rescale(point)
         theta = Coordinates.of(composed, point, fitted)
-        point = theta.point(point, descended(cost, local, none, far=FAR))
-        runs.rescaled(point)
+        point = theta.point(point, minimise(cost, local, none, far=FAR))
+        runs.rescale(point)
         theta = Coordinates.of(composed, point, fitted)
         information, pull = told(none)
         if p and m > 1:  # as if every row were so many
@@ -277,13 +295,16 @@ def learned(composed: Composed, calibration: Calibration | None, unit: np.ndarra
 
         less = information.sum(0) - information[u] + bend
         step = np.linalg.lstsq(less, pull.sum(0) - pull[u] + push, rcond=None)[0]
-        missed[u] = runs.losses(theta.point(point, halved(without, none, step)), u)[1]
+        missed[u] = runs.losses(theta.point(point, best_of_halves(without, none, step)), u)[1]
     return Old(point, theta, runs.units, information, pull, bend, dependence, missed, runs.scale)
 
 
 def units_of(old: Composed, new: Composed) -> tuple[np.ndarray, np.ndarray]:
-    """The unit of every row of OLD and of NEW: the motion, or where NEW makes few, which OLD makes too, a
-    stretch of it; what a model gets wrong all along a motion that OLD never made says the same in each."""
+    """The unit of every row of OLD and of NEW.
+
+    A unit is a motion, because a model is wrong in the same way all along it. Where NEW makes few motions,
+    all of which OLD makes too, it is a stretch of one.
+    """
     every = motions(old.simulator, [*old.recordings, *new.recordings])
     number = every[: len(old.recordings)], every[len(old.recordings) :]
     few = len(set(number[1]))

@@ -1,21 +1,24 @@
-"""Whitening: a window's rows are correlated through its uncertain start and through what no one models.
+"""Whitening: a window's rows are correlated through its uncertain start and through what no effect explains.
 
 With sensitivities D to the start, its variances P, and unmodelled accelerations a_c of each channel the rows
 of a window have covariance
 
     N + D P D' + sum over channels s_c^2 L_c A L_c',   A[u, v] = exp(-|u - v| / TAU),
 
-N the sensors' noise, L_c two integrals over time for a position, one for a velocity, none for a force or
-where the simulator cannot be restarted: what is not modelled moves a joint even where the model has it
-stuck. A body that moves on a support is another matter, for the support takes what pushes it: there L_c is
-the model's own response to a change of the start's rate, come later. In flight and in contact a model is off
-by other amounts: each regime has sizes of its own. Times of samples are uncertain by s of the source `clock`,
-which adds s^2 times the squared rate. No impact is like another: which corner strikes first, where a surface
-is rough. In the source `contacts` every effect may be off by s of its usual sizes, anew in each window in
-which bodies move in contact, so that few impacts that a model misses decide nothing. Nor does a body come to
-lie twice alike: by s of the sources `lying` it is elsewhere in each window of rest, and all that pushes it
-there is in that. The s_c are found by maximum likelihood (type II) and are zero where that gains nothing. The
-Cholesky factor turns rows into innovations: what each says beyond those before it in its window.
+with N the sensors' noise and L_c two integrals over time for a position, one for a velocity, none for a force
+or where the simulator does not restart: an unmodelled torque moves a joint even where the model has it stuck.
+A body that moves on a support is another matter, for the support takes what pushes it: there L_c is the
+model's own response to a later change of the start's rate. Each regime (flight, contact) has sizes of its
+own.
+
+There are further sources of discrepancy. `clock`: times of samples are uncertain by s, which adds s^2 times
+the squared rate. `contacts`: no impact is like another (which corner strikes first, where a surface is
+rough), so every effect may be off by s of its usual sizes, anew in each window of contact, and a few missed
+impacts decide nothing. `lying`: a body does not come to rest twice alike, so it is s elsewhere in each window
+of rest.
+
+The s are maximum-likelihood estimates (type II), and zero where that gains nothing. The inverse Cholesky
+factor turns rows into innovations: what each says beyond those before it in its window.
 """
 
 from __future__ import annotations
@@ -38,15 +41,15 @@ dpotrf: Any = lapack.dpotrf  # type: ignore[attr-defined]
 dtrtrs: Any = lapack.dtrtrs  # type: ignore[attr-defined]
 dtrtri: Any = lapack.dtrtri  # type: ignore[attr-defined]
 
-TAU = 0.1  # prior: s: unmodelled torques last for tenths of a second
+TAU = 0.1  # prior: s: how long unmodelled torques last
 ENOUGH = 40  # numerics: windows from which discrepancies are learned
-BLOCK = 100  # numerics: samples of a channel that are whitened together, where no start ties channels
-SMOOTH = 12  # numerics: directions of a channel in a block, of which what is smooth consists
-ALONE = -4.0  # prior: log odds of a window to be off for reasons of its own
-# numerics: log variances below a first guess; one source may end in the place of another, so of two starts
-# the better is taken
+BLOCK = 100  # numerics: samples of a channel that are whitened together where there is no start
+SMOOTH = 12  # numerics: smooth directions of a channel in a block
+ALONE = -4.0  # prior: log odds that a window is off for reasons of its own
+# numerics: log variances below a first guess; one source may end in another's place, so the better of two
+# starts is taken
 BELOW = (0.0, 8.0)
-WORTH = 3.0  # chosen: nats that a discrepancy must gain to be there at all
+WORTH = 3.0  # chosen: nats that a source must gain to count at all
 # numerics: log variances are found to a hundredth of a nat
 CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
 
@@ -57,8 +60,8 @@ NONE = Discrepancy()
 
 @dataclass(frozen=True)
 class Source:
-    """A discrepancy's covariance (k, k) at s = 1, or its variances (k,) where it ties no rows, and which rows
-    of the block it is of (k,)."""
+    """A discrepancy's covariance (k, k) at s = 1 among some `rows` (k,) of a block, or its variances (k,)
+    where it correlates none."""
 
     rows: np.ndarray
     covariance: np.ndarray
@@ -71,11 +74,11 @@ class Source:
 
 @dataclass(frozen=True)
 class Block:
-    """Rows (n,) of one window that belong together.
+    """Correlated rows of one window.
 
-    The noise's `variance` (n,); `start` (n, S): by how much each state of the uncertain start moves them at
-    one standard deviation; sources of discrepancy by name; the rows' `channel` (n,); `repeats`: in how many
-    logs the same motion is made.
+    `rows`: their numbers (n,); `window`: the window; `variance`: of sensor noise (n,); `start`: change (n, S)
+    by one standard deviation of each state of the start; `sources`: discrepancies by name; `channel`: the
+    rows' channels (n,); `repeats`: the number of logs that repeat the same motion.
     """
 
     rows: np.ndarray
@@ -87,7 +90,7 @@ class Block:
     repeats: int = 1
 
     def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
-        """The rows' covariance (n, n)."""
+        """The rows' covariance (n, n) with a discrepancy."""
         out = np.diag(self.variance) + self.start @ self.start.T
         for name, s in discrepancy.items():
             if name in self.sources:
@@ -97,7 +100,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Whitener:
-    """Inverse lower Cholesky factors of blocks of rows, and by block half the log determinant of their
+    """Inverse lower Cholesky factors of blocks of rows, and half the log determinant of each block's
     covariance."""
 
     blocks: tuple[np.ndarray, ...]
@@ -105,7 +108,7 @@ class Whitener:
     half_logs: tuple[float, ...]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Rows (N,) or columns (N, k), whitened; rows of diverged windows become 0."""
+        """Whiten rows (N,) or columns (N, k); rows of diverged windows become 0."""
         out = np.zeros_like(values, float)
         for block, inverse in zip(self.blocks, self.inverses, strict=True):
             out[block] = inverse @ values[block]
@@ -139,7 +142,7 @@ class Covariances:
         return _Smooth.of(self.blocks[::every], self.names)
 
     def floor(self) -> float:
-        """The expected squares of whitened rows if there is noise alone, of which starts are read too."""
+        """The expected squares of whitened rows under noise alone, from which starts are read too."""
         total = 0.0
         for block in self.blocks:
             factor = _factored(block.covariance())
@@ -147,9 +150,13 @@ class Covariances:
             total += float(np.sum(solved_by(factor, sure) ** 2))
         return total
 
-    def learned(self, residual: np.ndarray, wide: Mapping[int, float] | None = None) -> Discrepancy:
-        """The discrepancy of a residual (N,) by maximum likelihood; sources for which it gains less than
-        WORTH have none. `wide`: windows whose variance is larger, by which factor."""
+    def estimate(self, residual: np.ndarray, wide: Mapping[int, float] | None = None) -> Discrepancy:
+        """The discrepancy of a residual, by maximum likelihood; none of sources that gain less than WORTH.
+
+        Args:
+            residual: The residual (N,).
+            wide: Windows with a larger variance, and its factor.
+        """
         smooth, names = self._smooth, self.names
         left, rest = smooth.projected(residual, wide or {})
         kept = list(range(len(names)))
@@ -174,7 +181,8 @@ class Covariances:
     def whitener(
         self, discrepancy: Discrepancy | None = None, wide: Mapping[int, float] | None = None
     ) -> Whitener:
-        """The whitener of all rows; `wide`: by window the factor of a variance that is larger there."""
+        """The whitener of all rows with a discrepancy; `wide`: windows with a larger variance, and its
+        factor."""
         made = [_whitened(block, discrepancy or NONE) for block in self.blocks]
         factor = [1.0 if wide is None else wide.get(block.window, 1.0) for block in self.blocks]
         return Whitener(
@@ -186,10 +194,12 @@ class Covariances:
             ),
         )
 
-    def off_alone(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
-        """Windows in which a residual (N,) is larger than noise and discrepancy make it, each by which factor
-        of its variance: a start misread where a joint came to rest moves all that follows, and no model is to
-        explain it. Beforehand one in a few dozen is."""
+    def outliers(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
+        """Windows whose residual (N,) exceeds noise and discrepancy, with the factor of their variance.
+
+        A start misread where a joint came to rest moves all that follows, and no model is to explain it. One
+        window in a few dozen is expected to be such.
+        """
         square, count = dict[int, float](), dict[int, int]()
         white = whiten(residual) ** 2
         for block in self.blocks:
@@ -204,11 +214,11 @@ class Covariances:
 
 
 def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float]:
-    """A block's factor and half log determinant.
+    """A block's Cholesky factor and half log determinant.
 
-    Of G repeats with one discrepancy d of covariance K between them, what they tell together of anything that
-    they have in common is what each tells by N + G K, added up: (N / G + K)^-1 = G (N + G K)^-1. The mean has
-    the log determinant of N + G K, what differs between them that of N.
+    Of G repeats with one discrepancy d of covariance K in common, the sum of what each tells with N + G K is
+    what all tell together of anything that they have in common: (N / G + K)^-1 = G (N + G K)^-1. Their mean
+    has the log determinant of N + G K, their differences that of N.
     """
     again = block.repeats if discrepancy else 1
     shared = {n: s * again**0.5 for n, s in discrepancy.items()}
@@ -222,13 +232,15 @@ def _whitened(block: Block, discrepancy: Discrepancy) -> tuple[np.ndarray, float
 
 @dataclass(frozen=True)
 class _Smooth:
-    """Blocks, in units of the rows' noise, by the directions in which starts and discrepancies move them
-    most, padded to one size: covariances without a discrepancy (B, m, m) and of each source at s = 1
-    (K, B, m, m); `basis` by block (n, m).
+    """The likelihood of the discrepancies, cheaply: blocks in the directions in which starts and
+    discrepancies move them most, in units of the rows' noise and padded to one size.
 
-    In all other directions rows count as independent ones, each by the `share` (N,) that is left of it, with
-    a variance of 1 and of each source at s = 1 (K, N): what ties no rows is as large there. By the former
-    alone what is smooth could be called white, at the expense of all rows.
+    In all other directions rows count as independent, each with the `share` (N,) that is left of it, with
+    variance 1 and that of each source at s = 1, `white` (K, N): what correlates no rows is as large there. By
+    the smooth directions alone what is smooth could be called white, at the expense of all rows.
+
+    `basis` by block (n, m); covariances without discrepancy, `plain` (B, m, m), and of each source at s = 1,
+    `source` (K, B, m, m).
     """
 
     rows: tuple[np.ndarray, ...]
@@ -277,8 +289,8 @@ class _Smooth:
         return cls(rows, windows, tuple(scale), tuple(basis), plain, source, share, white)
 
     def projected(self, residual: np.ndarray, wide: Mapping[int, float]) -> tuple[np.ndarray, np.ndarray]:
-        """A residual (N,) in the blocks' directions (B, m), as if no window were `wide`, and what is left of
-        it (N,), both in units of noise."""
+        """A residual (N,) along the blocks' directions (B, m) and what is left of it (N,), in units of the
+        noise, `wide` windows narrowed."""
         out, rest = np.zeros(self.plain.shape[:2]), []
         for i, (rows, sd, b) in enumerate(zip(self.rows, self.scale, self.basis, strict=True)):
             mine = residual[rows] / sd / wide.get(self.windows[i], 1.0) ** 0.5
@@ -287,7 +299,7 @@ class _Smooth:
         return out, np.concatenate(rest or [np.zeros(0)])
 
     def first_guess(self, left: np.ndarray) -> np.ndarray:
-        """Log variances (K,): each such that all of them together make up the squares."""
+        """Log variances (K,) with which all sources together make up the squares."""
         trace = np.einsum("kbii->kb", self.source)
         squares = np.sum(left**2, 1)
         out = []
@@ -300,7 +312,7 @@ class _Smooth:
     def cost(
         self, x: np.ndarray, left: np.ndarray, rest: np.ndarray, kept: list[int]
     ) -> tuple[float, np.ndarray]:
-        """Minus the log likelihood at log variances (k,) of the sources that are kept, and its gradient."""
+        """Minus the log likelihood at log variances (k,) of the `kept` sources, and its gradient (k,)."""
         variance = np.exp(x)
         whole = self.plain + np.tensordot(variance, self.source[kept], 1) if kept else self.plain
         inverse = np.linalg.inv(whole)
@@ -322,7 +334,7 @@ class _Smooth:
 
 
 def _factored(matrix: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factor, by LAPACK itself: of many small matrices most time would go into checks."""
+    """Lower Cholesky factor, by LAPACK itself: checks would take most time with many small matrices."""
     factor, fault = dpotrf(matrix, lower=1, clean=1)
     if fault:
         raise np.linalg.LinAlgError("not positive definite")
@@ -330,7 +342,7 @@ def _factored(matrix: np.ndarray) -> np.ndarray:
 
 
 def solved_by(factor: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """L^-1 columns (n, k) of a lower factor L (n, n)."""
+    """L^-1 columns (n, k) with a lower factor L (n, n)."""
     if not columns.size:
         return np.zeros(columns.shape)
     out, fault = dtrtrs(factor, columns, lower=1)
@@ -359,7 +371,7 @@ def covariances(composed: Composed, linear: Linear) -> Covariances:
 
 
 def _by_channel(linear: Linear, window: slice) -> list[np.ndarray]:
-    """Rows of stretches of each channel: without a start, nothing ties channels."""
+    """Stretches of each channel's rows, as nothing correlates channels without a start."""
     channel = linear.rows.channel[window]
     out = []
     for c in np.unique(channel):
@@ -368,10 +380,10 @@ def _by_channel(linear: Linear, window: slice) -> list[np.ndarray]:
     return out
 
 
-CLOCK = "clock"  # a source whose s [s] is the sd of samples' times
-LIES = "lying"  # a source whose s is the sd of where a body comes to rest, anew in each window, by channel
-CONTACTS = "contacts"  # a source whose s is how many usual sizes every effect is off by in each contact
-INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # physics: of an acceleration
+CLOCK = "clock"  # s: standard deviation of the samples' times [s]
+LIES = "lying"  # s: standard deviation of where a body comes to rest, by channel
+CONTACTS = "contacts"  # s: usual sizes by which every effect is off in each contact
+INTEGRALS = {"position": 2, "velocity": 1, "force": 0, "torque": 0}  # physics: of an acceleration over time
 
 
 def _sources(
@@ -404,8 +416,8 @@ def _sources(
 
 
 def _propagated(t: np.ndarray, since: np.ndarray, channel: np.ndarray, kick: np.ndarray) -> np.ndarray:
-    """How rows (N,) respond to accelerations at times t (n,), (N, n): as they do to a change of the start's
-    rate, `kick` (N,), that comes as much later."""
+    """Response (N, n) of rows to accelerations at times t (n,): as to a change of the start's rate, `kick`
+    (N,), that comes later."""
     step = np.gradient(t) if t.size > 1 else np.ones(1)
     out = np.zeros((since.size, t.size))
     for c in np.unique(channel):
@@ -417,7 +429,8 @@ def _propagated(t: np.ndarray, since: np.ndarray, channel: np.ndarray, kick: np.
 
 @lru_cache(maxsize=512)
 def _integrated(since: bytes, times: int) -> np.ndarray:
-    """Covariance (n, n) of unmodelled accelerations, integrated so many times; windows are mostly alike."""
+    """Covariance (n, n) of unmodelled accelerations, integrated `times` times; cached, as most windows are
+    alike."""
     t = np.frombuffer(since)
     out = np.exp(-np.abs(t[:, None] - t) / TAU)
     for _ in range(times):
@@ -426,8 +439,8 @@ def _integrated(since: bytes, times: int) -> np.ndarray:
 
 
 def _integral(t: np.ndarray) -> np.ndarray:
-    """The matrix (n, n) that integrates over t from the window's start, by trapezia; before the first row
-    a signal was as it is there."""
+    """The matrix (n, n) that integrates over t from the window's start, by trapezia; before its first row a
+    signal is constant."""
     step = np.diff(t, prepend=0.0)
     lower = np.tril(np.ones((t.size, t.size)))
     mean = 0.5 * (np.eye(t.size) + np.eye(t.size, k=-1))

@@ -37,11 +37,9 @@ FLIES, RESTS, STRIKES = REGIMES = ("nothing touches", "bodies rest on each other
 class Window:
     """Rows [begin, end) of a log.
 
-    Attributes:
-        log, begin, end: Number of the log and its rows.
-        forward: Whether the start is smoothed from later samples alone.
-        start, doubt: Its states and their standard deviations; None where the simulator does not restart.
-        regime: One of REGIMES, where the simulator reports contacts.
+    `log`, `begin`, `end`: number of the log and its rows; `forward`: whether the start is smoothed from later
+    samples alone; `start`, `doubt`: its states and their standard deviations; None where the simulator does
+    not restart; `regime`: one of REGIMES, where the simulator reports contacts.
     """
 
     log: int
@@ -75,7 +73,8 @@ def cut(
         touching = _touching(simulator, log)
         rests = touching & resting(log, reach)
         turns = np.flatnonzero(np.diff(rests.astype(int))) + 1
-        marks = [*_marks(simulator, log), *log.t[turns].tolist()]
+        contacts = getattr(simulator, "contacts", None)
+        marks = [*([] if contacts is None else map(float, contacts(log))), *log.t[turns].tolist()]
         edges = _edges(log, marks, length)
         edges[0] = _readable(simulator, log, edges[1])
         for begin, end in itertools.pairwise(edges):
@@ -148,12 +147,6 @@ def travel(values: np.ndarray) -> float:
     """The range of values (n,), NaN left out."""
     seen = values[np.isfinite(values)]
     return float(np.ptp(seen)) if seen.size else 0.0
-
-
-def _marks(simulator: Simulator, log: Recording) -> list[float]:
-    """Times [s] of the log at which contacts change."""
-    contacts = getattr(simulator, "contacts", None)
-    return [] if contacts is None else [float(t) for t in contacts(log)]
 
 
 def _touching(simulator: Simulator, log: Recording) -> np.ndarray:

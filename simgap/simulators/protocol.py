@@ -1,7 +1,7 @@
 """What the diagnosis needs of a simulator: its parameters, its channels, and runs.
 
-A simulator is any object with `parameters`, `channels` and `simulate`; it need not inherit from anything
-here, and `parameters` and `channels` may hold plain dicts (`simgap.simulators.user` reads them).
+A simulator is any object with `parameters`, `channels` and `simulate`; it inherits from nothing here, and
+`parameters` and `channels` may hold plain dicts (`simgap.simulators.user` reads them).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from simgap.effect import Parameter
 from simgap.simulators.recording import Recording
 
 KINDS = ("position", "velocity", "force", "torque", "command")
-RATE = "_rate"  # a position channel's rate in `start` is its name with this behind it
+RATE = "_rate"  # suffix of a position channel's rate in `start`
 
 Values = Mapping[str, float]  # parameter or state name -> value
 Channels = Mapping[str, np.ndarray]  # channel name -> (num_timesteps,)
@@ -27,7 +27,7 @@ Channels = Mapping[str, np.ndarray]  # channel name -> (num_timesteps,)
 class Channel:
     """One column of the logs: `unit`, standard deviation `noise` of one sample, `kind` (one of KINDS).
 
-    A command is given to the simulator and not compared. NaN noise is learned from the recording.
+    A command is given to the simulator and not compared. NaN noise is estimated from the recording.
     """
 
     unit: str
@@ -43,7 +43,8 @@ class Channel:
 
 @dataclass(frozen=True)
 class Job:
-    """One run: full `parameters`, the `recording` (a window of it) that it is run along, `start` or None."""
+    """One run along a `recording` (a window of it) with all `parameters`, from `start` or, if None, as the
+    simulator sees fit."""
 
     parameters: Values
     recording: Recording
@@ -52,17 +53,17 @@ class Job:
 
 @runtime_checkable
 class Simulator(Protocol):
-    """A model of the robot that can be run along a recording.
+    """A model of a robot that can be run along a recording.
 
-    `simulate` gives every channel that is no command at the times `recording.t`. `start` maps each
-    position channel to its value at `recording.t[0]`, and its name followed by `_rate` to its
-    rate; None starts as the simulator sees fit. A simulator that takes no `start` is compared open loop.
+    `simulate` returns every channel but commands at the times `recording.t`. `start` maps each position
+    channel to its value at `recording.t[0]`, and its name followed by `_rate` to its rate; None starts as the
+    simulator sees fit. A simulator that takes no `start` is compared open loop.
 
-    Optional: `state_at(recording, t)` gives state name -> (value, standard deviation) where position
-    channels do not tell the state; `contacts(recording)` gives times [s] at which windows are to begin;
-    `simulate_many(jobs)` runs several jobs at once, None in the place of one that diverged; `numerics` are
-    parameters of the solver and not of the robot, whose small changes are not varied along with others';
-    `window` [s] is how long it is run from one start, where errors of a start die out and that may be long.
+    Optional: `state_at(recording, t)` returns state name -> (value, standard deviation) where position
+    channels do not determine the state; `contacts(recording)` returns times [s] at which windows begin;
+    `simulate_many(jobs)` runs several jobs at once, None for one that diverged; `numerics` names parameters
+    of the solver rather than the robot; `window` [s] is how long it is run from one start, longer where
+    errors of a start die out.
     """
 
     @property
@@ -80,13 +81,13 @@ class Simulator(Protocol):
             start: By position channel its first value, and under its name with `_rate` its first rate.
 
         Returns:
-            By name every channel that is no command (num_samples,), at the recording's times.
+            By name every channel but commands (num_samples,), at the recording's times.
         """
         ...
 
 
 def run_all(simulator: Simulator, jobs: Sequence[Job]) -> list[Channels | None]:
-    """Every job's channels; None where the simulator diverged (a value that is not finite)."""
+    """Run all jobs; None where the simulator diverged (a value that is not finite)."""
     many = getattr(simulator, "simulate_many", None)
     if many is not None:
         return list(many(jobs))

@@ -1,4 +1,4 @@
-"""A log of a robot: times and columns, whole or a window of it."""
+"""A log of a robot: times and columns, all of it or a window."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from hmmseg.io.units import Column
 
 @dataclass(frozen=True)
 class Recording:
-    """Times `t` (num_timesteps,) [s] and `columns` by name, of the rows `first` and up of a whole log.
+    """Times `t` (num_timesteps,) [s] and `columns` by name, from row `first` of a whole log.
 
-    NaN is a missing sample. `recording["q1"]` is a column; `warnings` say what its file left out.
+    NaN is a missing sample. `recording["q1"]` is a column; `warnings` tell what was left out of its file.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Recording:
         return Recording(self.name, self.t[begin:end], columns, self.first + begin)
 
     def with_columns(self, columns: Mapping[str, np.ndarray]) -> Recording:
-        """The recording with some columns replaced."""
+        """The recording with some columns added or replaced."""
         return replace(self, columns={**self.columns, **columns})
 
 
@@ -54,7 +54,7 @@ def read_recording(
 ) -> Recording:  # fmt: skip
     """Read the columns that a simulator needs from a file of any kind.
 
-    Where columns come at rates of their own, in rows of their own, the rows of the fastest are kept.
+    Columns that come at rates of their own, in rows of their own, are brought to the rows of the fastest.
 
     Args:
         path: The file.
@@ -62,8 +62,7 @@ def read_recording(
         times: The column of times.
         unit: Its unit [s].
         commands: Columns that are held from sample to sample.
-        acts: Name of a further column, of the times [s] at which each row's commands were given, which is
-            added where rows differ in that.
+        acts: Name of a column to add where rows differ in when their commands were given: these times [s].
 
     Returns:
         The recording.
@@ -85,9 +84,11 @@ def read_recording(
 
 
 def _on_one_clock(log: Recording, commands: Collection[str], acts: str | None) -> Recording:
-    """The rows of the column that is read most often; slower ones are interpolated there as topics of a log
-    are, and commands count as they are held on average until the next row; or, where all are given together
-    and once a row at most, as they are, from when they were given."""
+    """The rows of the column that is read most often.
+
+    Slower columns are interpolated like topics of a log. Commands count with their mean until the next row;
+    or, where all are given together and at most once a row, as they are, from when they were given.
+    """
     rows = {name: np.flatnonzero(np.isfinite(values)) for name, values in log.columns.items()}
     if all(np.median(np.diff(each)) <= 1 for each in rows.values() if each.size > 1):
         return log
@@ -119,7 +120,7 @@ def _on_one_clock(log: Recording, commands: Collection[str], acts: str | None) -
 
 
 def held(values: np.ndarray) -> np.ndarray:
-    """A column (num_timesteps,) whose missing samples hold the one before, the first ones the next."""
+    """A column (num_timesteps,) whose missing samples repeat the one before; leading ones the next."""
     there = np.flatnonzero(np.isfinite(values))
     if not there.size:
         return values

@@ -1,7 +1,7 @@
-"""A simulator out of a user's Python file: `my_robot.py:Robot`.
+"""A simulator in a user's Python file: `my_robot.py:Robot`.
 
-All that a user's code does goes through `calling`, and what it gives back through `given_back`: whatever it
-does, the answer is one line that names its file and line.
+A user's code runs within `calling`, and what it returns is checked by `Checks`: whatever it does, the error
+is one line that names its file and line.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from simgap.simulators.protocol import Channel, Channels, Job, Simulator, Values
 from simgap.simulators.recording import Recording
 
 Kind = TypeVar("Kind", Parameter, Channel)
-PATIENCE = 300.0  # limit: s that one call may take, unless the simulator states a `timeout` of its own
+PATIENCE = 300.0  # limit: s that one call may take, unless the simulator states a `timeout`
 LONGEST = 1e6  # limit: s; more is a slip of the pen
-BY_LOG = ("shift", "offset")  # what each log may have of its own (`simgap.robot_effects.readouts`)
+BY_LOG = ("shift", "offset")  # what may differ between logs (`simgap.robot_effects.readouts`)
 
 
 @dataclass(frozen=True)
 class UserSimulator:
-    """A user's object with its parameters and channels checked; what it offers beyond them is kept."""
+    """A user's object with checked parameters and channels, and what else it offers."""
 
     parameters: Mapping[str, Parameter]
     channels: Mapping[str, Channel]
@@ -59,7 +59,7 @@ def load_simulator(spec: str) -> UserSimulator:
             attributes `parameters` and `channels`.
 
     Returns:
-        The simulator, all its calls checked.
+        The simulator, with all calls checked.
 
     Raises:
         InputError: The file or the name is missing, its code fails, or what it declares cannot be used.
@@ -88,14 +88,16 @@ def load_simulator(spec: str) -> UserSimulator:
 
 
 class _Late(BaseException):
-    """A call has taken too long; no `except Exception` of the user's holds it up."""
+    """A call takes too long. No `except Exception` of the user's catches it."""
 
 
 @contextmanager
 def calling(where: str, file: str, expected: str = "", patience: float = PATIENCE) -> Iterator[None]:
-    """Within it a user's code runs: whatever it raises becomes an InputError with the line of its `file`, and
-    so does a call of more than `patience` [s], where it runs Python in the main thread of a POSIX system. An
-    interrupt stays one."""
+    """Run a user's code: whatever it raises becomes an InputError with the line of its `file`.
+
+    So does a call of more than `patience` [s], where it runs Python in the main thread of a POSIX system. An
+    interrupt stays one.
+    """
     timed = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
 
     def late(*_: Any) -> None:
@@ -122,7 +124,7 @@ def calling(where: str, file: str, expected: str = "", patience: float = PATIENC
 
 
 def _line(error: BaseException, where: str, file: str) -> str:
-    """The last line of the user's own file on the way to an exception, in its words for where."""
+    """The last line of the user's own file on the way to an exception; `where` if there is none."""
     if isinstance(error, SyntaxError) and error.lineno is not None:
         return f"{error.filename}, line {error.lineno}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -132,8 +134,11 @@ def _line(error: BaseException, where: str, file: str) -> str:
 
 @dataclass(frozen=True)
 class Checks:
-    """How a user's functions are called: `where` they are named, their `file`, `patience` [s], and the
-    `channels` that a run must give back."""
+    """Checked calls of a user's functions.
+
+    `where` they are named, their `file`, `patience` [s] with a call, and the `channels` that a run must
+    return.
+    """
 
     where: str
     file: str
@@ -141,13 +146,13 @@ class Checks:
     channels: tuple[str, ...]
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
-        """The function's answer."""
+        """Call a function."""
         with calling(self.where, self.file, patience=self.patience):
             return function(*args)
 
     def simulate(self, run: Callable[..., Any], parameters: Values, recording: Recording,
                  start: Values | None = None) -> Channels:  # fmt: skip
-        """One run; it gets copies of all that it might change."""
+        """One run, with copies of all that it might change."""
         more = () if start is None else (dict(start),)
         return self.given_back(run, self.call(run, dict(parameters), _lent(recording), *more), recording)
 
@@ -202,7 +207,7 @@ class Checks:
         return out
 
     def of(self, run: Callable[..., Any]) -> str:
-        """A function by its file and line, or as the command named it."""
+        """A function's file and line, or how the command named it."""
         code = getattr(inspect.unwrap(getattr(run, "__func__", run)), "__code__", None)
         return self.where if code is None else f"{code.co_filename}, line {code.co_firstlineno}"
 
@@ -211,7 +216,7 @@ SAID = 200  # look: characters of a user's own message
 
 
 def _numbers(value: Any) -> np.ndarray | None:
-    """A copy of real numbers, whole ones and logical ones among them; None where it holds others."""
+    """A copy of real numbers, integers and booleans included; None of anything else."""
     try:
         found = np.asarray(value)
         return np.array(found, float) if found.dtype.kind in "biufO" else None
@@ -229,7 +234,7 @@ def _shown(value: Any) -> str:
 
 
 def _lent(recording: Recording) -> Recording:
-    """The recording with arrays that cannot be written to."""
+    """The recording with read-only arrays."""
 
     def lent(values: np.ndarray) -> np.ndarray:
         out = values.view()
@@ -241,7 +246,7 @@ def _lent(recording: Recording) -> Recording:
 
 
 def checked(found: Any, where: str) -> UserSimulator:
-    """The object as a simulator; InputError names the attribute, parameter or channel at fault."""
+    """Check a user's object; InputError names the attribute, parameter or channel at fault."""
     file = where.removeprefix("--simulator ").rpartition(":")[0]
     with calling(where, file):
         return _checked(found, where, file)
@@ -298,6 +303,6 @@ def _made(kind: type[Kind], value: Any, where: str) -> Kind:
 
 
 def restarts(simulator: Simulator) -> bool:
-    """Whether it can be started from a given state."""
+    """Whether a simulator can be started from a given state."""
     declared = getattr(simulator, "restarts", None)
     return bool("start" in inspect.signature(simulator.simulate).parameters if declared is None else declared)

@@ -75,7 +75,12 @@ def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
         table = {
             name: {key: value for key, (value, _) in entries.items()} for name, entries in measured.items()
         }
-    return {name: _block(table.get(name), f"{path}: key {name}") for name in task.objects}
+    return blocks_of(table, task, str(path))
+
+
+def blocks_of(table: Mapping[str, Any], task: BlockTask, where: str) -> dict[str, Block]:
+    """Blocks from a table of their properties, as `read_properties` reads it from the file `where`."""
+    return {name: _block(table.get(name), f"{where}: key {name}") for name in task.objects}
 
 
 def _block(entry: Any, where: str) -> Block:

@@ -52,7 +52,7 @@ def shift(design, name, channel=None):
 
 def mean_over_grip(aligned, i, move, key, values):
     """The mean of `values` (num_timesteps,) of trial i that a grip's observation takes."""
-    return float((aligned[0][i].weights.grips[move][key] @ np.nan_to_num(values)).mean())
+    return float((aligned[0][i].grips[move][key] @ np.nan_to_num(values)).mean())
 
 
 def test_a_force_bias_adds_to_the_net_force_and_through_the_pads_to_lengths(design, case):
@@ -144,10 +144,10 @@ def test_what_a_failed_trial_does_not_show_is_left_out(case, aligned):
     weighed, noise, found = aligned
     cut = []
     for a in weighed:
-        grips, counts = dict(a.weights.grips), dict(a.weights.counts)
+        grips, counts = dict(a.grips), dict(a.counts)
         grips[1] = {k: np.zeros_like(v) for k, v in grips[1].items()}
         counts[1] = {k: np.zeros_like(v) for k, v in counts[1].items()}
-        cut.append(replace(a, weights=replace(a.weights, grips=grips, counts=counts)))
+        cut.append(replace(a, grips=grips, counts=counts))
     design = build(found, cut, noise)
     # Block 1 moved down from block 2 onto the ground: its rise tells block 2's height.
     assert set(design.names) == {("block1", "weight"), ("block1", "width"), ("block2", "height")}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimation.friction import FrictionPosterior, Stretch, friction_posteriors, largest_ratio, slip_evidence
-from estimation.observations import WeighedTrial, Weights, subtask_masks
+from estimation.observations import WeighedTrial, subtask_masks
 from hmmseg.contact.decompose import FREE, subtasks
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig, Systematic
@@ -34,8 +34,8 @@ def aligned(signals: Signals, task: BlockTask, boundaries: np.ndarray) -> Weighe
             grips[s.move] = {"force": inside / np.maximum(inside.sum(axis=1, keepdims=True), 1)}
             counts[s.move] = {"force": inside.sum(axis=1)}
     uniform = free / max(free.sum(), 1)
-    weights = Weights(grips, counts, uniform, np.tile(uniform, (4, 1)), float(free.sum()))
-    return WeighedTrial(signals, masks, weights)
+    robust = np.tile(uniform, (4, 1))
+    return WeighedTrial(signals, masks, grips, counts, uniform, robust, float(free.sum()))
 
 
 def planted(

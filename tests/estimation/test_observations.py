@@ -9,9 +9,9 @@ from estimation.observations import (
     autocorrelation_time,
     channel_values,
     draw_boundaries,
+    estimated_noise,
     gravity_factor,
     held_as_described,
-    learned,
     robust_weights,
     subtask_masks,
 )
@@ -56,7 +56,7 @@ def test_sampling_variance_of_the_mean_against_monte_carlo(noise):
         weights, residual, centre = robust_weights(v, np.ones(per_grip, bool), scale)
         centres.append(centre)
         pairs.append((residual, weights))
-    predicted = learned({"force": pairs}, {"force": scale}, {}).variance["force"] / per_grip
+    predicted = estimated_noise({"force": pairs}, {"force": scale}, {}).variance["force"] / per_grip
     assert predicted == pytest.approx(np.var(centres), rel=0.1)
 
 
@@ -64,7 +64,7 @@ def test_without_residuals_nothing_has_weight_and_noise_is_white_and_as_stated()
     weights, residual, centre = robust_weights(np.full(4, np.nan), np.ones(4, bool), 1.0)
     assert not weights.any() and np.isnan(residual).all() and np.isnan(centre)
     assert autocorrelation_time([np.array([1.0, -0.5])]) == 1.0
-    noise = learned({"force": [(np.array([np.nan]), np.array([1.0]))]}, {"force": 0.3}, {})
+    noise = estimated_noise({"force": [(np.array([np.nan]), np.array([1.0]))]}, {"force": 0.3}, {})
     assert noise.variance["force"] == pytest.approx(0.09) and noise.count["force"] == 1.0
 
 
@@ -84,16 +84,16 @@ def test_autocorrelation_time_of_a_known_process(rho, expected):
 
 def test_few_residuals_are_no_less_noisy_than_the_rig_states_but_by_chance():
     quiet, loud = ([(size * np.array([-1.0, 1.0, 0.0]), np.ones(3))] for size in (0.01, 3.0))
-    shy = learned({"force": quiet}, {"force": 1.0}, {"force": 1.0})
-    alone = learned({"force": quiet}, {"force": 1.0}, {})
+    shy = estimated_noise({"force": quiet}, {"force": 1.0}, {"force": 1.0})
+    alone = estimated_noise({"force": quiet}, {"force": 1.0}, {})
     own = alone.count["force"]
     expected = (STATED + own * alone.variance["force"]) / (STATED + own)
     assert shy.variance["force"] == pytest.approx(expected) and shy.count["force"] == STATED + own
     # What is recorded may be noisier than its sensors.
-    assert learned({"force": loud}, {"force": 3.0}, {"force": 1.0}) == learned(
+    assert estimated_noise({"force": loud}, {"force": 3.0}, {"force": 1.0}) == estimated_noise(
         {"force": loud}, {"force": 3.0}, {}
     )
-    none = learned({"force": [(np.array([0.1]), np.ones(1))]}, {"force": 1.0}, {"force": 0.2})
+    none = estimated_noise({"force": [(np.array([0.1]), np.ones(1))]}, {"force": 1.0}, {"force": 0.2})
     assert none.variance["force"] == pytest.approx(0.04) and none.count["force"] == STATED
 
 

@@ -13,7 +13,6 @@ from hmmseg.contact.decompose import (
     Decomposition,
     Source,
     balance,
-    contact_states,
     decompose,
     determined,
     height_equations,
@@ -239,9 +238,9 @@ def test_balance_agrees_with_the_jacobian_of_a_forward_model():
         rank = (values > 1e-7).sum()
         return np.abs(rows[rank:]).max(axis=0, initial=0.0)[:4] > 1e-6
 
-    carry = list(contact_states(PAPER))[1:4]
-    slide = [s for s in contact_states(BlockTask({"block1": "block2", "block2": GROUND},
-                                                 (Move("block1", "block2", slide=True),)))][1:4]  # fmt: skip
+    carry = subtasks(PAPER)[1:4]
+    sliding = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", "block2", slide=True),))
+    slide = subtasks(sliding)[1:4]
     names = [
         ("weight", "block1"),
         ("width", "block1"),
@@ -250,11 +249,11 @@ def test_balance_agrees_with_the_jacobian_of_a_forward_model():
     ]
     forward = {id(carry): [(on_support, 1), (lifted, 0), (on_support, 0)],
                id(slide): [(on_support, 1), (slipping, 1), (on_support, 1)]}  # fmt: skip
-    for states in (carry, slide):
+    for steps in (carry, slide):
         for chosen in ([0], [1], [2], [0, 1], [0, 2], [1, 2], [0, 1, 2]):
             for loads in (1, 3):
-                rows = determined(e for i in chosen for e in balance(i, states[i], loads))
-                free = free_directions([forward[id(states)][i] for i in chosen], loads)
+                rows = determined(e for i in chosen for e in balance(steps[i], loads))
+                free = free_directions([forward[id(steps)][i] for i in chosen], loads)
                 assert [name in rows for name in names] == list(~free), (chosen, loads)
 
 

@@ -16,10 +16,10 @@ from hmmseg.segmentation.pads import (
     _compliance,
     _unfiltered,
     lateness,
-    limited,
     read_again,
+    resampled,
 )
-from hmmseg.segmentation.stretches import NONE, Stretch, Toe, find, fitted, reading, steepest
+from hmmseg.segmentation.stretches import NONE, Stretch, Toe, find_toe, fit_slope, reading, steepest
 
 PRIOR = (2.5e-4, 0.75e-4)
 
@@ -38,10 +38,10 @@ def squeeze(step=0.02, compliance=2.5e-4):
 
 def test_the_slope_of_a_squeeze_is_the_compliance():
     load, value = reading(squeeze())
-    slope, information = fitted(load, value, 2e-5)
+    slope, information = fit_slope(load, value, 2e-5)
     assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5)
     assert np.std(value + slope * load) < 4e-5
-    assert fitted(load[:3], value[:3], 2e-5) == fitted(0 * load, value, 2e-5) == (0.0, 0.0)
+    assert fit_slope(load[:3], value[:3], 2e-5) == fit_slope(0 * load, value, 2e-5) == (0.0, 0.0)
 
 
 def test_loads_that_ring_while_nothing_moves_say_little_of_the_pads():
@@ -51,7 +51,7 @@ def test_loads_that_ring_while_nothing_moves_say_little_of_the_pads():
     held = np.where(since > 0, 4.0, 1.0)  # N
     ring = 2.0 * np.sin(160 * since) * np.exp(-since / 0.3)
     place = 0.02 - 2.5e-4 * held + 2e-5 * np.random.default_rng(1).standard_normal(s.t.size)
-    flat = fitted(held + ring, place, s.sd)
+    flat = fit_slope(held + ring, place, s.sd)
     assert flat[0] < 0.5 * 2.5e-4 and flat[1] > (0.2 * 2.5e-4) ** -2  # and sure of it
     found = _compliance([(held + ring, place, s.sd)], PRIOR, 2.0)
     assert found.value == pytest.approx(PRIOR[0], abs=found.sd) and found.sd > 0.5 * PRIOR[1]
@@ -73,7 +73,7 @@ def test_a_small_delay_leaves_both_ends_of_a_contact(shift):
     load, place = reading(s, shift)
     assert load.size == place.size == s.t.size
     np.testing.assert_allclose(load, np.interp(s.t + shift, s.t, s.load), atol=0.2)  # 3 ms of a squeeze
-    assert fitted(load, place, s.sd)[0] == pytest.approx(2.5e-4, rel=0.1)
+    assert fit_slope(load, place, s.sd)[0] == pytest.approx(2.5e-4, rel=0.1)
 
 
 def world(**effects):
@@ -114,11 +114,11 @@ def test_a_jump_is_not_smeared_over_the_samples_before_it():
     t = np.arange(20) * 0.05
     jump = np.where(t < 0.5, 0.0, 1.0)
     for late in (0.01, 0.02, 0.03, 0.04):
-        again = limited(t + late, t, jump)
+        again = resampled(t + late, t, jump)
         assert set(again[:-1]) == {0.0, 1.0}
         assert abs(t[np.argmax(again > 0.5)] - (0.5 - late)) <= 0.5 * 0.05 + 1e-9
     smooth = np.sin(2 * t)
-    np.testing.assert_allclose(limited(t + 0.02, t, smooth)[:-1], np.sin(2 * (t + 0.02))[:-1], atol=6e-3)
+    np.testing.assert_allclose(resampled(t + 0.02, t, smooth)[:-1], np.sin(2 * (t + 0.02))[:-1], atol=6e-3)
 
 
 def test_friction_is_the_steepest_ratio_that_a_contact_shows_for_sure():
@@ -221,7 +221,7 @@ def releases(toe=NONE, number=8, compliances=(1e-4,), seed=0):
 
 @pytest.mark.parametrize("planted", [Toe(6e-4, 0.8), Toe(3e-4, 1.6)])
 def test_a_planted_toe_is_found(planted):
-    found = find(releases(planted))
+    found = find_toe(releases(planted))
     at = np.array([0.0, 0.2, 1.0, 4.0])
     np.testing.assert_allclose(found.give(at), planted.give(at), atol=6e-5)
     assert found.slope == pytest.approx(planted.slope, rel=0.3)
@@ -229,12 +229,12 @@ def test_a_planted_toe_is_found(planted):
 
 @pytest.mark.parametrize("compliances", [(1e-4,), (1e-4, 2e-4)])
 def test_straight_contacts_have_none_however_they_differ(compliances):
-    assert all(find(releases(compliances=compliances, seed=seed)) is NONE for seed in range(10))
+    assert all(find_toe(releases(compliances=compliances, seed=seed)) is NONE for seed in range(10))
 
 
 def test_a_contact_that_stiffens_the_other_way_has_none():
-    assert find(releases(Toe(-4e-4, 0.8))) is NONE
+    assert find_toe(releases(Toe(-4e-4, 0.8))) is NONE
 
 
 def test_too_few_samples_show_nothing():
-    assert find([]) is NONE and find([(np.ones(3), np.ones(3), SD)]) is NONE
+    assert find_toe([]) is NONE and find_toe([(np.ones(3), np.ones(3), SD)]) is NONE

@@ -103,7 +103,7 @@ def test_a_log_and_a_file_of_several(tmp_path, capsys):
 @pytest.mark.parametrize("case", ["none_1", "paper_blocks"])
 def test_nothing_is_proposed_where_nothing_is_needed(case):
     found = inspect(NONE.parent / case / "trial_01.csv")
-    assert (found.mapping, found.said) == ({}, ())
+    assert (found.mapping, found.remarks) == ({}, ())
 
 
 @pytest.mark.parametrize(

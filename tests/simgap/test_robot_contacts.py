@@ -5,7 +5,7 @@ import pytest
 
 from simgap.robot_effects import readouts
 from simgap.robot_effects.base import Setting
-from simgap.robots.linear import base_at, linearise, wobbling
+from simgap.robots.linear import base_at, linearise, with_wobble
 from simgap.robots.model import Composed
 from simgap.robots.rows import phases_of, rows_of
 from simgap.robots.whiten import CONTACTS, LIES, Discrepancy, covariances
@@ -139,7 +139,7 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     (scale,) = [e for e in every if e.name == "readout.scale"]
     noise = dict.fromkeys(POSE, 1e-4)
     composed = Composed.of(simulator, [log], {scale.name: scale}, noise, 0.2)
-    composed = wobbling(composed, linearise(composed, {}, [scale.name]))
+    composed = with_wobble(composed, linearise(composed, {}, [scale.name]))
     linear = linearise(composed, {}, [scale.name])
     usual = {CONTACTS: 1.0, "z, lying": 2e-2 * 0.05}
     whiten = covariances(composed, linear).whitener(Discrepancy(usual))

@@ -7,7 +7,7 @@ from simgap_swing import Swing, log
 
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
-from simgap.robots.fit import _prior, _slope, moved_to
+from simgap.robots.fit import _prior, _slope, fit_effects
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.rows import noises
@@ -26,7 +26,7 @@ def composed(robot, logs) -> Composed:
 
 def fit(model: Composed, point):
     linear = linearise(model, {}, [])
-    return moved_to(model, linear, covariances(model, linear).whitener(), point)
+    return fit_effects(model, linear, covariances(model, linear).whitener(), point)
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +54,9 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
 def test_what_is_settled_stays(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing = search.nothing()
-    first = search.settled(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
+    first = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
     assert first.score > nothing.score + 100
-    again = search.settled(("viscous",), first.point, [first.whiten])
+    again = search.fit(("viscous",), first.point, [first.whiten])
     assert abs(again.score - first.score) < BETTER
 
 
@@ -96,10 +96,10 @@ def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
     search, names = Search(model, tuple(model.effects), model.rows.log), ("viscous_a", "viscous_b")
     none = search.nothing()
     assert {*none.discrepancy} >= {"angle_a", "angle_b"}
-    sets, levels = search.place(none, names)
+    sets, levels = search.propose(none, names)
     hidden = float(sets.scores([names[:1]], 0)[0] - sets.scores([()], 0)[0])
     large, small, both = (
-        search.settled(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, [levels[-1]])
+        search.fit(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, [levels[-1]])
         for one in (names[:1], names[1:], names)
     )
     assert large.score - none.score > 1.5 * hidden > 30

@@ -13,7 +13,7 @@ from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
-from simgap.robots.rows import learned, noises, phases_by_task, resolution, rows_of
+from simgap.robots.rows import estimate_noise, noises, phases_by_task, resolution, rows_of
 from simgap.robots.sets import identifiability
 from simgap.robots.whiten import NONE, covariances
 from simgap.robots.windows import REACH, smoothed
@@ -148,11 +148,11 @@ def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
     model = composed([log(s) for s in range(3)])
     linear = linearise(model, {}, [])
     cov = covariances(model, linear)
-    assert cov.learned(linear.residual) == NONE
+    assert cov.estimate(linear.residual) == NONE
     off = composed([log(s, viscous=0.01) for s in range(3)])
     linear = linearise(off, {}, [])
     cov = covariances(off, linear)
-    found = cov.learned(linear.residual)
+    found = cov.estimate(linear.residual)
     assert set(found) >= {"angle"} and found["angle"] > 0.1
     white = cov.whitener(found)(linear.residual)
     assert 0.4 < np.mean(white**2) < 1.6 < np.mean(cov.whitener()(linear.residual) ** 2)
@@ -195,13 +195,13 @@ def test_motion_is_no_noise(course):
     """A fall's second difference at 150 Hz is 0.4 mm, twenty times this noise."""
     t, rng = np.arange(3000) / 150, np.random.default_rng(0)
     log = Recording("log.csv", t, {"z": course(t) + 2e-5 * rng.standard_normal(t.size)})
-    assert learned([log], "z") == pytest.approx(2e-5, rel=0.1)
+    assert estimate_noise([log], "z") == pytest.approx(2e-5, rel=0.1)
 
 
 def test_a_log_too_short_for_a_difference_tells_none():
     log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
-    assert learned([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
-    assert learned([log.window(0, 2)], "z") == 1.0
+    assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
+    assert estimate_noise([log.window(0, 2)], "z") == 1.0
 
 
 def still_then_swinging(seed: int, begin: float):

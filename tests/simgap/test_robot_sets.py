@@ -91,13 +91,13 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
     true = Discrepancy({"p": 0.7})
     root = [np.linalg.cholesky(b.covariance(true)) for b in cov.blocks]
     rows = np.concatenate([each @ rng.standard_normal(80) for each in root])
-    found = cov.learned(rows)
+    found = cov.estimate(rows)
     assert {*found} == {"p"} and found["p"] == pytest.approx(0.7, rel=0.2)
     white = cov.whitener(found)(rows)
     assert np.mean(white**2) == pytest.approx(1.0, rel=0.1)
-    assert cov.off_alone(cov.whitener(found), rows) == {}
+    assert cov.outliers(cov.whitener(found), rows) == {}
     rows[160:240] *= 3.0
-    wide = cov.off_alone(cov.whitener(cov.learned(rows)), rows)
+    wide = cov.outliers(cov.whitener(cov.estimate(rows)), rows)
     assert {*wide} == {2} and wide[2] == pytest.approx(9.0, rel=0.4)
 
 

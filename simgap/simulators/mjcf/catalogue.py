@@ -1,7 +1,7 @@
-"""What of a MuJoCo model is offered as a cause: its joints, bodies, contacts, actuators and its own options.
+"""What a MuJoCo model offers as causes: its joints, bodies, contacts, actuators and its own options.
 
-Usual sizes are shares of what the robot shows along the logs: torques by inverse dynamics of the smoothed
-motion.
+Usual sizes are shares of what the robot shows along the logs; torques are from inverse dynamics of the
+smoothed motion.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from simgap.simulators.mjcf.transmission import (
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
-GAP = 0.02  # prior: of a joint's reach: the usual play
+GAP = 0.02  # prior: share of a joint's reach: the usual play
 JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
-SIZE = 0.1  # prior: of a value that the model states: the usual size of what is wrong with it
-GEOMS = 4  # chosen: pairs of touching geoms, those that touch most, whose contact is offered
+SIZE = 0.1  # prior: share of a stated value: the usual size of its error
+GEOMS = 4  # chosen: geoms whose contact is offered, those that touch most
 
 
 def offered(
     simulator: MjcfSimulator, recordings: Sequence[Recording], named: Sequence[str]
 ) -> list[RobotEffect]:
-    """Give the simulator its parameters, and the candidates beyond them."""
+    """Set the simulator's parameters, and return the candidates beyond them."""
     motions = [motion_of(simulator, log) for log in recordings]
     catalogue = _Catalogue(simulator)
     joints = catalogue.driven_joints()
@@ -69,7 +69,7 @@ def offered(
 
 
 class _Catalogue:
-    """Parameters, their settings in the model and what they say, gathered one after another."""
+    """Parameters, their settings in the model and their descriptions, gathered one after another."""
 
     def __init__(self, simulator: MjcfSimulator) -> None:
         self.simulator, self.model = simulator, simulator.model
@@ -79,7 +79,7 @@ class _Catalogue:
 
     def add(self, name: str, sd: float, says: str = "", low: float = -np.inf, high: float = np.inf,
             effect: str | None = None, setting: Setting | None = None) -> None:  # fmt: skip
-        """A parameter about the model's own value, unless it has no size; an effect may have several."""
+        """Add a parameter about the model's value, unless its size is zero; an effect may have several."""
         setting = setting_of(self.model, name) if setting is None else setting
         nominal = setting.nominal
         if not sd > 0 or not np.isfinite(sd):
@@ -89,13 +89,13 @@ class _Catalogue:
         self.says[effect or name] = says or f"{name} is not as the model has it"
 
     def driven_joints(self) -> list[int]:
-        """Hinges and slides with a name that are read as joints."""
+        """Named hinges and slides that are read as joints."""
         m, read = self.model, self.simulator.joints.values()
         moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in (HINGE, SLIDE) and name_of(m, "joint", j)]
         return [j for j in moving if j in read]
 
     def add_joints(self, joints: Sequence[int], motions: Sequence[Motion]) -> None:
-        """Friction, rotor inertia and stiffness of joints; friction by load, speed or direction, and drag."""
+        """Friction, rotor inertia and stiffness of joints; friction by load, speed, direction; and drag."""
         for j in joints:
             name, size = name_of(self.model, "joint", j), sizes_of(motions, j)
             head, torque, rate = f"joint:{name}", SHARE * size.torque, size.rate
@@ -116,7 +116,7 @@ class _Catalogue:
             self.add(speed.name, 0.1 * rate, says, 0.03 * rate, effect=f"{head}.stribeck", setting=speed)
 
     def add_actuators(self) -> None:
-        """Gains, velocity gains and saturation of actuators that a log drives."""
+        """Gain, velocity gain, fading and saturation of actuators that a log drives."""
         m = self.model
         for a in sorted({*self.simulator.driven.values()}):
             name, head = name_of(m, "actuator", a), f"actuator:{name_of(m, 'actuator', a)}"
@@ -133,7 +133,7 @@ class _Catalogue:
                 self.add(f"{head}.limit", sd, f"saturation of {name}", low=1e-9)
 
     def add_bodies(self, joints: Sequence[int]) -> None:
-        """Mass, centre of mass, payload and link length of bodies that move by themselves."""
+        """Mass, centre of mass, payload and link length of bodies with joints of their own."""
         m = self.model
         for b in sorted({int(m.jnt_bodyid[j]) for j in (*joints, *self.simulator.free)}):
             name, mass = name_of(m, "body", b), float(m.body_mass[b])
@@ -153,7 +153,7 @@ class _Catalogue:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
 
     def _add_payload(self, body: str) -> None:
-        """A load where the map says, or where one is likely to be."""
+        """A load where the map says, or where one is likely."""
         m, stated = self.model, self.simulator.map.payload_at.get(body)
         at = payload_place(m, body)
         if isinstance(stated, str):
@@ -167,7 +167,7 @@ class _Catalogue:
     def add_play(
         self, joints: Sequence[int], motions: Sequence[Motion], logs: Mapping[str, Recording]
     ) -> None:
-        """Play between the motors and the joints that they move."""
+        """Play between motors and the joints that they move."""
         m, simulator, wanted, made = self.model, self.simulator, tuple(self.settings), {}
         for column, a in simulator.driven.items():
             j = int(m.actuator_trnid[a, 0])
@@ -195,7 +195,7 @@ class _Catalogue:
         simulator.played = made
 
     def add_options(self) -> None:
-        """Gravity's direction, and of the simulation its step, its solver and how it holds commands."""
+        """Gravity's direction, and the simulation's step, solver and holding of commands."""
         if np.linalg.norm(self.model.opt.gravity) > 0:
             says = "drives carry this share of the weights by themselves (gravity compensation)"
             self.add("drive.gravity_compensation", 0.1, says, low=-0.5, high=1.5)
@@ -229,7 +229,7 @@ class _Catalogue:
             self.add(f"geom:{name}.size", 0.01, f"size of {name}", low=-0.5)
 
     def add_named(self, named: Sequence[str]) -> None:
-        """What the user names beyond these."""
+        """Settings that the user names beyond these."""
         for name in named:
             if name not in self.parameters:
                 nominal = setting_of(self.model, name).nominal
@@ -237,7 +237,7 @@ class _Catalogue:
 
 
 def _touching(simulator: MjcfSimulator, recordings: Sequence[Recording]) -> list[int]:
-    """Geoms that touch along the recorded motion, those of moving bodies that touch most."""
+    """The geoms that touch most along the recorded motion, those of moving bodies first."""
     if not simulator.touching:
         return []
     count = Counter(

@@ -1,4 +1,4 @@
-"""MuJoCo itself, whose bindings carry no types that a checker could read; its warnings are counted."""
+"""MuJoCo, whose bindings have no types for a checker; its warnings are counted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WARNED: Counter[str] = Counter()
 
 
 def _count(text: str | bytes) -> None:
-    """Instead of MuJoCo's own way: a line for each on the terminal, and in a file in the current folder."""
+    """Count a warning; MuJoCo itself would print each and write a file into the current folder."""
     line = text.decode(errors="replace") if isinstance(text, bytes) else text
     _WARNED[line.split(" Time = ")[0].strip().rstrip(".")] += 1
 

@@ -1,14 +1,14 @@
-"""Laws that MuJoCo's models lack and that go by the state: friction by load, speed or direction, drag, drives
-that fade.
+"""Laws that MuJoCo lacks and that depend on the state: friction by load, speed or direction, drag, fading
+drives.
 
-Friction is a constraint that holds a joint at rest: its limit is set before each step,
+Friction is a constraint that holds a joint at rest; its limit is set before each step,
 
     limit = frictionloss + share |m + b| / 2 + extra exp(-(w / speed)^2) + skew sign(w),
 
-w the joint's rate, m the torque of its motors and b what gravity and the other joints' motion take: what the
-gears press on from either side, in balance the torque that they transmit (model M4 of Duclusaud et al.,
-Extended friction models for the physics simulation of servo actuators, 2024). A drive that fades gives
-f (1 - fade |f| / most), most what it can give at all. A step takes what the one before it had.
+with w the joint's rate, m the torque of its motors and b that of gravity and the other joints' motion: what
+presses on the gears from either side, in balance the torque that they transmit (model M4 of Duclusaud et al.,
+Extended friction models for the physics simulation of servo actuators, 2024). A fading drive gives f (1 -
+fade |f| / most), with most the largest force it can give. A step uses the quantities of the one before it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.setting import FADE, OF_JOINTS, most_of, object_id
 
-MOTOR = ":motor"  # behind a joint's name: of the motor, where it is a body of its own
+MOTOR = ":motor"  # suffix of a joint's name: its motor, where that is a body of its own
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class _Friction:
 
 @dataclass(frozen=True)
 class Laws:
-    """Laws that act in a model: `friction` of joints, and by drive that fades its actuator, the fade over the
-    most that it can give, and the part of a joint's torque (nv,) that its force makes."""
+    """Laws that act in a model: `friction` of joints, and of `fading` drives the actuator, the fade over its
+    largest force, and the joint torques (nv,) of a unit force."""
 
     friction: tuple[_Friction, ...]
     fading: tuple[tuple[int, float, np.ndarray], ...]
@@ -49,7 +49,7 @@ class Laws:
 
     @classmethod
     def of(cls, model: Any, changed: Sequence[tuple[str, float]]) -> Laws:
-        """Those that settings name which are changed, in this model."""
+        """The laws of the changed settings."""
         joints: dict[str, dict[str, float]] = {}
         fading = []
         for name, value in changed:
@@ -71,19 +71,27 @@ class Laws:
 def _friction(model: Any, joint: str, own: Mapping[str, float]) -> _Friction:
     j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{joint}{MOTOR}")
     dof = int(model.jnt_dofadr[object_id(model, "joint", joint) if j < 0 else j])
-    return _Friction(dof, own.get("load_friction", 0.0), own.get("direction_friction", 0.0),
-                     own.get("stribeck_extra", 0.0), max(own.get("stribeck_speed", 1.0), 1e-9),
-                     own.get("quadratic_drag", 0.0))  # fmt: skip
+    share, skew, extra, speed, drag = ({"stribeck_speed": 1.0, **own}.get(n, 0.0) for n in OF_JOINTS)
+    return _Friction(dof, share, skew, extra, max(speed, 1e-9), drag)
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Sensors (B, steps, sensors) of runs from full states (B, size) with controls (B, steps, actuators), as
-    `mujoco.rollout` gives them, with laws that act."""
+    """Run a model with laws.
+
+    Args:
+        model, data: MuJoCo's.
+        laws: What acts.
+        first: Full states (B, size) to run from.
+        control: Controls (B, steps, actuators).
+
+    Returns:
+        Sensors (B, steps, sensors), as of `mujoco.rollout`.
+    """
     out = np.empty((*control.shape[:2], model.nsensordata))
     plain = np.array(model.dof_frictionloss)
     usual = plain.tolist()
     step, pushed, every = mujoco.mj_step, data.qfrc_applied, model.dof_frictionloss
-    # A view gives and takes plain numbers, several times as fast as an array.
+    # A memoryview reads and writes plain numbers, several times as fast as an array.
     seen = every, data.qvel, data.qfrc_actuator, data.qfrc_bias, data.actuator_force
     views: list[Any] = [memoryview(each) for each in seen]
     limit, rate, motor, bias, force = views

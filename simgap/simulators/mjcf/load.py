@@ -1,4 +1,4 @@
-"""A MuJoCo model and a map, read and checked: the simulator, how to read logs, candidates."""
+"""A MuJoCo model and its map, read and checked: the simulator, its logs, its candidates."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from simgap.simulators.recording import Recording, held, read_recording
 
 @dataclass(frozen=True)
 class Loaded:
-    """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs; `digest`:
-    a hash of model and map."""
+    """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs; `digest`: a
+    hash of model and map."""
 
     simulator: MjcfSimulator
     map: Map
@@ -35,7 +35,7 @@ class Loaded:
     digest: bytes
 
     def read(self, path: Path) -> Recording:
-        """A log in SI, as the map has it; InputError where a unit cannot be."""
+        """Read a log in SI units, as the map says; InputError where a unit cannot be right."""
         columns = self.map.columns
         raw = read_recording(
             path, columns, self.map.time, self.map.time_factor,
@@ -61,7 +61,8 @@ class Loaded:
         return replace(log, warnings=tuple(warnings))
 
     def effects(self, recordings: Sequence[Recording]) -> list[RobotEffect]:
-        """Candidates that need the model: those it can set become its parameters, the rest are given."""
+        """Candidates that need the logs. Those that the model can be set to become parameters of the
+        simulator; the others are returned."""
         return offered(self.simulator, recordings, self.candidates)
 
 
@@ -71,13 +72,13 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     Args:
         xml: The MJCF or URDF file.
         map_file: Its map (TOML).
-        candidates: Names of further settings that are to be causes.
+        candidates: Names of further settings to offer as causes.
 
     Returns:
         The simulator, and how logs are read for it.
 
     Raises:
-        InputError: MuJoCo does not read the model, or the map or a candidate names what it does not have.
+        InputError: MuJoCo does not read the model, or the map or a candidate names what the model lacks.
     """
     if not xml.is_file():
         raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
@@ -121,7 +122,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     return Loaded(simulator, described, candidates, tuple(warnings), digest)
 
 
-# By thing and kind: MuJoCo's sensor, and the SI unit of what turns and of what slides.
+# By thing and kind: MuJoCo's sensor, and the SI units if it rotates and if it slides.
 READ = {
     ("joint", "position"): ("JOINTPOS", "rad", "m"),
     ("joint", "velocity"): ("JOINTVEL", "rad/s", "m/s"),
@@ -135,7 +136,7 @@ READ = {
 
 
 def _add_sensors(spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[str, int]]:
-    """A sensor for each compared column: column -> (sensor's name, component)."""
+    """Add a sensor for each compared column: column -> (sensor's name, component)."""
     out: dict[str, tuple[str, int]] = {}
     for column, m in columns.items():
         if m.kind == "command":
@@ -160,7 +161,7 @@ def _add_sensors(spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[st
 def _simulator(
     model: Any, described: Map, address: Mapping[str, tuple[str, int]]
 ) -> tuple[MjcfSimulator, list[str]]:
-    """The simulator of a model and its map, without parameters; what its columns leave open."""
+    """The simulator without parameters, and warnings of what its columns leave open."""
     file = described.file
     channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
     for column, m in described.columns.items():
@@ -206,12 +207,12 @@ def _simulator(
 
 
 def _turns(model: Any, m: Mapped) -> bool:
-    """Whether a column is of a hinge, whose angle may be recorded with jumps by whole turns."""
+    """Whether a column is of a hinge, whose recorded angle may jump by whole turns."""
     return m.thing == "joint" and int(model.joint(m.name).type.item()) == HINGE
 
 
 def _unit(model: Any, m: Mapped) -> str:
-    """The SI unit of a column as the model has it."""
+    """The SI unit of a column."""
     if m.kind == "command":
         return "1" if m.unit is None else str(m.unit)
     if m.thing in ("body", "site"):
@@ -220,7 +221,7 @@ def _unit(model: Any, m: Mapped) -> str:
 
 
 def _check_unit(where: str, m: Mapped, si: str) -> None:
-    """InputError where a joint's, body's or site's column has the unit of something else."""
+    """InputError where a joint's, body's or site's column has a unit of another quantity."""
     given = known_unit(m.unit) if isinstance(m.unit, str) else None
     if given is None or m.thing not in ("joint", "body", "site"):
         return
@@ -230,12 +231,12 @@ def _check_unit(where: str, m: Mapped, si: str) -> None:
 
 
 SHORTEST = 1e-6  # limit: s of a solver's step; a second of it would take minutes
-LATITUDE = 0.2  # limit: share of a joint's range by which a log may exceed it
+LATITUDE = 0.2  # limit: share of a joint's range by which logs may exceed it
 FULL_TURNS = (-math.tau * 4, math.tau * 4)  # limit: rad; the range of a joint that states none
 
 
 def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
-    """InputError where angles are so large that they must be degrees, never guessed."""
+    """InputError where angles are so large that they must be degrees; units are never guessed."""
     for column, m in columns.items():
         if m.thing != "joint" or m.kind != "position":
             continue
@@ -249,7 +250,7 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
 
 
 def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
-    """InputError where a servo's goals are its joint's angles in other units, never guessed."""
+    """InputError where a servo's goals are its joint's angles in other units; units are never guessed."""
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
         joint = int(model.actuator_trnid[a, 0])
@@ -270,11 +271,11 @@ def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
                 raise InputError(f"{file}: column {column}", found, mend)
 
 
-SAME = math.log(2.0)  # limit: a servo that follows its goals at less or more than this factor follows none
+SAME = math.log(2.0)  # limit: logarithm of the factor by which a servo may miss its goals
 
 
 def _clipped(simulator: MjcfSimulator, log: Recording, file: str) -> list[str]:
-    """The warning about commands that the model clips."""
+    """Warnings of commands that the model clips."""
     model, out = simulator.model, []
     for column, a in simulator.driven.items():
         low, high = model.actuator_ctrlrange[a] if model.actuator_ctrllimited[a] else (-np.inf, np.inf)
@@ -288,7 +289,7 @@ def _clipped(simulator: MjcfSimulator, log: Recording, file: str) -> list[str]:
 
 
 def continuous(log: Recording, turn: Sequence[str]) -> Recording:
-    """Quaternion columns with signs that do not jump: q and -q are the same turn."""
+    """Quaternion columns whose signs do not jump: q and -q are the same rotation."""
     quat = np.array([log[n] for n in turn])
     dot = np.nansum(quat[:, 1:] * quat[:, :-1], 0)
     sign = np.cumprod(np.concatenate([[1.0], np.where(dot < 0, -1.0, 1.0)]))

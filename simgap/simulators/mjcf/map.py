@@ -37,7 +37,7 @@ KINDS = {
     "sensor": ("position", "velocity", "force", "torque"),
     "body": ("position",),
     "site": ("position",),
-}  # what is read of a thing of the model; the first where none is stated
+}  # quantities of each kind of object; the first is the default
 
 
 def _placed(value: Any, check: Callable[[Any], Any]) -> Any:
@@ -53,7 +53,7 @@ Place = Annotated[Name | tuple[Finite, Finite, Finite], WrapValidator(_placed)]
 class Mapped(Quantity):
     """One column: the joint, actuator, sensor, body or site of the model that it records.
 
-    `kind` says what of it, `axis` which component; SI = sign * unit * column + offset; `noise` is in the
+    `kind` is the quantity, `axis` its component; SI = sign * unit * column + offset; `noise` is in the
     column's unit.
     """
 
@@ -91,22 +91,22 @@ class Mapped(Quantity):
 
     @property
     def thing(self) -> str:
-        """Which kind of thing it is of."""
+        """The kind of object that it records."""
         return next(t for t in KINDS if getattr(self, t) is not None)
 
     @property
     def name(self) -> str:
-        """The thing's name in the model."""
+        """The object's name in the model."""
         return str(getattr(self, self.thing))
 
     @property
     def factor(self) -> float:
-        """What the column is multiplied by to be in SI."""
+        """The column times this is in SI."""
         return self.size * self.sign
 
     @property
     def sd(self) -> float:
-        """Standard deviation of a sample's noise in SI; NaN where it is not stated."""
+        """Standard deviation of a sample's noise in SI; NaN where not stated."""
         return math.nan if self.noise is None else abs(self.factor) * self.noise
 
 
@@ -117,9 +117,13 @@ class Clock(Quantity):
 
 
 class Map(StrictTable):
-    """The columns, their `clock`, the length of the windows that are compared [s], the `keyframe` to start
-    from what no column gives; `uncertain`: patterns of what was never measured, `sd` by name of what was;
-    `payload_at`: by body the site at which it carries a load, or that place [m] in the body's frame."""
+    """The map of a model.
+
+    `columns`: by name; `clock`: the column of times; `length`: of the windows that are compared [s];
+    `keyframe`: where what no column gives starts; `uncertain`: patterns of what was never measured; `sd`:
+    standard deviations of what was, by name; `payload_at`: by body the site where it carries a load, or the
+    place [m] in the body's frame.
+    """
 
     model_config = ConfigDict(populate_by_name=False)
 
@@ -160,7 +164,7 @@ class Map(StrictTable):
 
 
 def read_map(path: Path) -> Map:
-    """The map of a TOML file; InputError names the key at fault."""
+    """Read a map from a TOML file; InputError names the key at fault."""
     found = validated(Map, read_toml(path), str(path))
     found._file = str(path)
     return found
@@ -171,10 +175,17 @@ COMMANDS = {"cmd", "command", "u", "ctrl", "target", "des"}
 
 
 def proposed_map(xml: Path, columns: Sequence[tuple[str, str | None]]) -> tuple[str, list[str]]:
-    """A map's text for a model and a log's columns (name, unit), and the columns that no name decides.
+    """Propose a map for a model and the columns of a log.
 
-    A column is the joint, actuator or sensor whose name it holds, the longest such name: of a joint the speed
-    where the column says so, of an actuator where it speaks of a command.
+    A column is the joint, actuator or sensor with the longest name that it contains: a joint's velocity where
+    it speaks of speed, an actuator where it speaks of a command.
+
+    Args:
+        xml: The model.
+        columns: Name and unit of each column.
+
+    Returns:
+        The map's text, and the columns that no name decides.
     """
     from simgap.simulators.mjcf.engine import mujoco
     from simgap.simulators.mjcf.setting import names_of

@@ -1,4 +1,4 @@
-"""A MuJoCo model with a map as a simulator: windows are rolled out together in threads."""
+"""A MuJoCo model with a map as a simulator; windows are rolled out together, in threads."""
 
 from __future__ import annotations
 
@@ -24,11 +24,13 @@ from simgap.simulators.recording import Recording
 
 @dataclass
 class MjcfSimulator:
-    """The compiled model with a sensor for each compared column (`sensor` name -> address).
+    """A compiled model with a sensor for each compared column. What no column determines starts as the
+    model's own run of the whole log has it.
 
-    `joints`: by position column its joint; `driven`: by command column its actuator; `free`: by body, the
-    seven columns of its pose; `poses`: of every body whose whole pose is read. What no column tells starts as
-    the model's own run of the whole log has it.
+    `sensor`: address in the sensor data by compared column; `joints`: joint by position column; `driven`:
+    actuator by command column; `free`: columns of the pose by free joint; `poses`: columns of every body
+    whose whole pose is read; `played`: models with play in a joint, by setting; `spec`: what the model was
+    compiled from.
     """
 
     model: Any
@@ -57,14 +59,15 @@ class MjcfSimulator:
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
         self._nominal = {n: s.nominal for n, s in self.settings.items()}
+        self.uncertain, self.sd = self.map.uncertain, self.map.sd  # as the diagnosis asks for them
 
     def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
-        """One run; channels that are not finite where it diverged."""
+        """One run; its channels are NaN where it diverged."""
         (found,) = self.simulate_many([Job(parameters, recording, start)])
         return {n: np.full(len(recording), np.nan) for n in self.sensor} if found is None else found
 
     def simulate_many(self, jobs: Sequence[Job]) -> list[Channels | None]:
-        """Every job's channels, None where it diverged; jobs of the same parameters go together."""
+        """All jobs' channels, None of one that diverged; jobs with equal parameters run together."""
         out: list[Channels | None] = [None] * len(jobs)
         groups: dict[tuple, list[int]] = defaultdict(list)
         for i, job in enumerate(jobs):
@@ -84,7 +87,7 @@ class MjcfSimulator:
         return out
 
     def _all(self, jobs: Sequence[Job], changed: tuple[tuple[str, float], ...]) -> list[Channels | None]:
-        """Every job's channels with some settings changed."""
+        """All jobs' channels with some settings changed."""
         if plays := [n for n, _ in changed if n in self.played]:
             return self.played[plays[0]](jobs, self._states(jobs), changed, self.model)
         with changed_model(self.model, self.settings, changed):
@@ -96,7 +99,7 @@ class MjcfSimulator:
         return np.array([self._state(job, bare) for job in jobs])
 
     def _state(self, job: Job, bare: np.ndarray | None = None) -> np.ndarray:
-        """Full physics state at the window's start; `bare`: what it is where columns do not tell it."""
+        """Full physics state (size,) at a window's start; `bare`: the state that columns do not determine."""
         if job.start is None or bare is None:
             state = np.array(self._own_state(job.recording, job.start is None))
         else:
@@ -121,7 +124,7 @@ class MjcfSimulator:
         return state
 
     def _own_state(self, log: Recording, whole: bool) -> np.ndarray:
-        """What the model itself starts from; for a window, where its run of the whole log is by then."""
+        """The model's own start of a log; of a window, what its run of the whole log has reached."""
         if not whole and self._partial and log.name in self._runs:
             return self._runs[log.name][log.first]
         state = self._reset()
@@ -143,27 +146,17 @@ class MjcfSimulator:
 
     @property
     def numerics(self) -> frozenset[str]:
-        """Parameters of the simulation, not of the robot."""
-        return frozenset(n for n, s in self.settings.items() if s.mixed is not None or n in (HOLD, LATE))
+        """Parameters of the simulation rather than the robot."""
+        return self.dear | ({HOLD, LATE} & self.settings.keys())
 
     @property
     def dear(self) -> frozenset[str]:
-        """Those of them that cost a second run, of steps as fine as they are to be had."""
+        """Those of them that cost a second run."""
         return frozenset(n for n, s in self.settings.items() if s.mixed is not None)
 
     @property
-    def uncertain(self) -> tuple[str, ...]:
-        """Patterns of what was never measured, as the map has it."""
-        return self.map.uncertain
-
-    @property
-    def sd(self) -> Mapping[str, float]:
-        """Standard deviations that the map states, by effect."""
-        return self.map.sd
-
-    @property
     def states(self) -> tuple[str, ...]:
-        """Columns that a window's start is read from."""
+        """Columns from which a window's start is read."""
         return (*self.joints, *(n for m in self.free.values() for n in m.values()))
 
     @property
@@ -173,7 +166,7 @@ class MjcfSimulator:
         return states < self.model.nv or self.model.na > 0
 
     def prepare(self, recordings: Sequence[Recording]) -> None:
-        """Run whole logs once, where columns do not tell the whole state, to start windows from."""
+        """Run whole logs once to start windows from, where columns do not determine the whole state."""
         if not self._partial:
             return
         for log in recordings:
@@ -184,16 +177,16 @@ class MjcfSimulator:
             self._runs[log.name] = np.where(np.isfinite(found), found, first)
 
     def contacts(self, recording: Recording) -> list[float]:
-        """Times at which the set of touching bodies changes along the recorded motion."""
+        """Times [s] at which the set of touching bodies changes along the recorded motion."""
         if not self.touching:
             return []
         times, what = self.contact_states(recording)
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
     def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[Pairs]]:
-        """Times along the recorded motion, and at each the pairs of bodies that touch.
+        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch at each.
 
-        A contact begins and ends between samples: those on either side count too.
+        A contact begins and ends between samples, so the samples on either side count too.
         """
         t, none = recording.t[self._shown(recording)], frozenset[tuple[int, int]]()
         if not self.touching:
@@ -204,12 +197,12 @@ class MjcfSimulator:
         return t, closed(t, wide)
 
     def _shown(self, recording: Recording) -> np.ndarray:
-        """Samples at which contacts are looked at: 200 a second at most."""
+        """The samples at which contacts are checked, at most 200 a second."""
         span = float(recording.t[-1] - recording.t[0])
         return np.arange(0, len(recording), max(1, round(len(recording) / max(span * 200, 1.0))))
 
     def touched(self, recording: Recording) -> list[Pairs]:
-        """Pairs of geoms that touch along the recorded motion, at the samples looked at."""
+        """Pairs of geoms that touch at these samples of the recorded motion."""
         states = (*self.joints, *(m[a] for m in self.free.values() for a in POSE))
         at = [q for q, _ in self._places.values()]
         for joint in self.free:
@@ -229,15 +222,15 @@ def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | N
     return None if a is None or b is None else {n: a[n] + share * (b[n] - a[n]) for n in a}
 
 
-# chosen: s: a contact that is there again sooner was never lost: sensors' noise breaks it
+# chosen: s: a contact that returns sooner was never lost: noise of the sensors breaks it
 BROKEN = 0.04
 
 Pairs = frozenset[tuple[int, int]]
 
 
 def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
-    """What touches at times t, with gaps below BROKEN filled. A touch counts however brief it is, for an
-    impact is brief."""
+    """The pairs that touch at times t (n,), with gaps up to BROKEN filled. A touch counts however brief, like
+    an impact."""
     out = list(sets)
     for pair in frozenset().union(*sets):
         rows = [i for i, s in enumerate(sets) if pair in s]
@@ -248,7 +241,7 @@ def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
 
 
 def touching_pairs(model: Any, data: Any, poses: np.ndarray, at: Sequence[int]) -> list[Pairs]:
-    """Pairs of geoms that touch in each pose (n, k), whose coordinates are `at` these of the model's."""
+    """Pairs of geoms that touch in each pose (n, k) of the coordinates `at` (k,)."""
     out, none = [], frozenset()
     for pose in poses:
         data.qpos[at] = pose

@@ -1,9 +1,9 @@
-"""Play between a motor and the joint that it moves: two bodies, each of which is free within the gap.
+"""Play between a motor and its joint: two bodies, each free to move within the gap.
 
 MuJoCo's joints are stiff behind their actuators. With play a joint is split: its rotor, friction and actuator
 go to a motor of its own, and a tendon keeps motor and joint within half of the play of each other. The
-encoder is on the side of what is moved. A motor is not seen: where it is in the gap when a window begins is
-taken from a free run along the whole log.
+encoder is on the joint's side. A motor is not seen, so where it is in the gap when a window begins is taken
+from a free run along the whole log.
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ from simgap.simulators.mjcf.setting import Setting, changed_model, compiled, set
 from simgap.simulators.protocol import Channels, Job
 from simgap.simulators.recording import Recording
 
-WIDTH = ".width"  # the end of a setting's name: of the play of a joint [rad or m]
+WIDTH = ".width"  # suffix of the setting of a joint's play [rad or m]
 KEPT = 64  # numerics: free runs that are kept
 MOVES = ("damping", "frictionloss", "armature")  # what goes to the motor
-LIGHT = 1e-6  # numerics: kg and kg m^2: the motor's body, whose rotor is its joint's armature
+LIGHT = 1e-6  # numerics: kg, kg m^2: the motor's body; its rotor is its joint's armature
 
 
 @dataclass
 class Played:
-    """A model in which one joint has play; `logs` by name, `joint`: its number in the plain model, `width`:
-    the setting's name, `seen`: position columns with their joints."""
+    """A model in which one joint has play.
+
+    `joint`: its number in the plain model; `logs`: by name; `width`: the setting of the play; `seen`: joint
+    by position column.
+    """
 
     model: Any
     runs: Runs
@@ -46,7 +49,7 @@ class Played:
     def __call__(
         self, jobs: Sequence[Job], first: np.ndarray, changed: Sequence[tuple[str, float]], nominal: Any
     ) -> list[Channels | None]:
-        """Every job's channels from states (B, size) of the `nominal` model, None where one diverged."""
+        """All jobs' channels from states (B, size) of the `nominal` model; None of one that diverged."""
         width, nq, nv = dict(changed)[self.width], nominal.nq, nominal.nv
         q, v = int(nominal.jnt_qposadr[self.joint]), int(nominal.jnt_dofadr[self.joint])
         tendon = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_TENDON, f"{self.name}{WIDTH}")
@@ -61,8 +64,8 @@ class Played:
             return self.runs([j.recording for j in jobs], own, tuple(changed))
 
     def _ahead(self, log: Recording, width: float) -> np.ndarray:
-        """By how much the motor is ahead of its joint, and how much faster, at a log's samples (n, 2), in the
-        model as it came."""
+        """By how much the motor is ahead of its joint, and faster, at a log's samples (n, 2), in the model as
+        it came."""
         return latest(self.known, (log.name, width), lambda: self._run(log, width), KEPT)
 
     def _run(self, log: Recording, width: float) -> np.ndarray:
@@ -85,9 +88,19 @@ def played(
     spec: Any, name: str, actuator: str, make: Callable[[Any], Runs], wanted: Sequence[str],
     logs: Mapping[str, Recording], seen: Mapping[str, int],
 ) -> Played | None:  # fmt: skip
-    """The model of a spec with play in a joint of this name, which one actuator moves; None where the joint
-    has no rotor that could move alone, or MuJoCo does not take it. `wanted`: settings that it is to have;
-    `seen`: position columns with their joints."""
+    """Build the model with play in a joint.
+
+    Args:
+        spec: The MjSpec, which is changed.
+        name, actuator: The joint, and the actuator that moves it.
+        make: Makes the runs of a model.
+        wanted: Settings that the model is to have.
+        logs: By name.
+        seen: Joint by position column.
+
+    Returns:
+        The model; None where the joint has no rotor that could move alone, or MuJoCo refuses it.
+    """
     joint, body = spec.joint(name), spec.joint(name).parent
     if not joint.armature > 0:
         return None

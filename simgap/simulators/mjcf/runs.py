@@ -1,4 +1,4 @@
-"""Many windows run by MuJoCo at once: commands along them in, channels out."""
+"""Many windows run by MuJoCo at once, from commands to channels."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from simgap.simulators.recording import Recording
 
 
 class Held:
-    """Commands held from sample to sample, as each step of the simulator has them on average; of one window
-    (n,) or of many with as many samples each (B, n)."""
+    """Commands held from sample to sample, averaged over each step of the simulator; of one window (n,), or
+    of many with equally many samples (B, n)."""
 
     def __init__(self, since: np.ndarray, times: np.ndarray) -> None:
         self.since, self.times = since, times
@@ -30,8 +30,10 @@ class Held:
         self.at = self._at(since)
 
     def __call__(self, values: np.ndarray, line: float = 0.0) -> np.ndarray:
-        """Means (..., steps) of a column (..., n); missing samples hold the one before. `line`: the share of
-        the line to the next sample, in the place of a step."""
+        """Means (..., steps) of a column (..., n); missing samples repeat the one before.
+
+        `line`: from 0, held in steps, to 1, on lines to the next sample.
+        """
         seen = np.isfinite(values)
         if seen.all():
             t, u, k = self.since, values, self.at
@@ -51,14 +53,14 @@ class Held:
         return np.diff(here + (held + 0.5 * steep * late) * late) / self.width
 
     def _at(self, t: np.ndarray) -> np.ndarray:
-        """The sample that is held at each edge."""
+        """The sample held at each edge of a step."""
         if t.ndim > 1:
             return np.stack([self._at(one) for one in t])
         return np.clip(np.searchsorted(t, self.edges, side="right") - 1, 0, t.size - 1)
 
 
 class Between:
-    """Between points of an even grid of `times` (T,), `at` (B, n) in B windows, by cubics through neighbours
+    """Interpolation on an even grid of `times` (T,) at `at` (B, n) in B windows, by cubics through neighbours
     (Catmull & Rom 1974)."""
 
     def __init__(self, at: np.ndarray, times: np.ndarray) -> None:
@@ -70,7 +72,7 @@ class Between:
         self.rows = [np.clip(i + k, 0, times.size - 1) + first for k in (-1, 0, 1, 2)]
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Values (B, n, k) of those on the grid (B, T, k)."""
+        """Values (B, n, k) from those on the grid (B, T, k)."""
         flat, s = values.reshape(-1, values.shape[-1]), self.s
         p0, p1, p2, p3 = (flat[rows] for rows in self.rows)
         bend = s * (p2 - p0) + s**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + s**3 * (3 * (p1 - p2) + p3 - p0)
@@ -79,7 +81,7 @@ class Between:
 
 def free_run(model: Any, data: Any, log: Recording, first: np.ndarray, driven: Mapping[str, int]
              ) -> np.ndarray:  # fmt: skip
-    """Full states (num_timesteps, size) at a log's samples, of a run along all of it from `first` (size,)."""
+    """Full states (num_timesteps, size) at a log's samples, run freely from `first` (size,)."""
     since, step = log.t - log.t[0], float(model.opt.timestep)
     times = np.arange(int(np.ceil(since[-1] / step)) + 2) * step
     control, held = np.zeros((1, times.size, model.nu)), Held(since, times)
@@ -90,7 +92,7 @@ def free_run(model: Any, data: Any, log: Recording, first: np.ndarray, driven: M
 
 
 def body_rate(quat: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """Angular velocity (3,) in the body's frame, 2 conj(q) dq/dt, of a unit quaternion, scalar first."""
+    """Angular velocity (3,) [rad/s] in the body's frame, 2 conj(q) dq/dt, of a unit quaternion q."""
     w, x, y, z = quat
     a, b, c, d = rate
     return 2 * np.array(
@@ -99,7 +101,7 @@ def body_rate(quat: np.ndarray, rate: np.ndarray) -> np.ndarray:
 
 
 def aligned(log: Recording, out: dict[str, np.ndarray], columns: Mapping[str, str]) -> None:
-    """Turn the sign of simulated quaternions to the recorded ones': both are the same turn."""
+    """Give simulated quaternions the sign of the recorded ones, in place: both are the same rotation."""
     turn = [columns[a] for a in ("qw", "qx", "qy", "qz") if columns[a] in out]
     if len(turn) == 4:
         dot = sum(np.nan_to_num(log[n]) * out[n] for n in turn)
@@ -108,20 +110,21 @@ def aligned(log: Recording, out: dict[str, np.ndarray], columns: Mapping[str, st
             out[n] = out[n] * sign
 
 
-# A column of the times [s] from which on each row's commands are carried out; with "next" behind it when
-# those that follow are, and with a command's name what these are.
+# A column of the times [s] from which each row's commands are carried out; suffixed "next", of the commands
+# that follow, and suffixed with a command's name, what follows.
 ACTS = "acts:"
 BATCH = 4e7  # numerics: numbers that one batch of rollouts holds at most
 KEPT = 1e8  # limit: bytes of the latest runs that are kept
-FAR = 1e9  # numerics: what reads beyond it has diverged
+FAR = 1e9  # numerics: a run that reads beyond it has diverged
 
 
 @dataclass
 class Runs:
-    """Runs of the `model` in threads, one for each of `data`; the rest as in `MjcfSimulator`.
+    """Runs of the `model` in threads, one for each of `data`; the other fields as in `MjcfSimulator`.
 
-    The same windows are run hundreds of times: how they lie on the steps is kept. So are the latest runs, for
-    many are needed again: a finite difference in one number of the solver contains all others' runs.
+    The same windows are run hundreds of times, so how they lie on the steps is kept. So are the latest runs,
+    because many are needed again: a finite difference in one number of the solver includes the runs of all
+    others.
     """
 
     model: Any
@@ -136,8 +139,8 @@ class Runs:
     def __call__(
         self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[tuple[str, float], ...]
     ) -> list[Channels | None]:
-        """Channels along logs from states (B, size), None where one diverged. `changed`: the settings in
-        which the model is now another one than as it came."""
+        """Channels along logs from states (B, size), None of one that diverged. `changed`: settings in which
+        the model now differs from how it came."""
         longest = max(float(log.t[-1] - log.t[0]) for log in logs)
         numbers = first.shape[1] + self.model.nsensordata + self.model.nv
         size = max(1, int(BATCH / ((longest / self.model.opt.timestep + 2) * numbers)))
@@ -186,7 +189,8 @@ class Runs:
         return latest(self._ran, key, run, int(KEPT / size))
 
     def _side(self, logs: Sequence[Recording], times: np.ndarray) -> tuple[Held, Between]:
-        """How windows of as many samples lie on the steps: how their commands are held and sensors read."""
+        """How windows with equally many samples lie on the steps: to hold their commands and read their
+        sensors."""
         since = np.array([log.t - log.t[0] for log in logs])
         key = (since.shape, since.tobytes(), times.size, float(times[1]))
         return latest(self._sides, key, lambda: (Held(since, times), Between(since, times)))
@@ -194,7 +198,8 @@ class Runs:
     def _read(
         self, logs: Sequence[Recording], sensed: np.ndarray, side: tuple[Held, Between], times: np.ndarray
     ) -> list[Channels | None]:
-        """Sensors (B, steps, sensors) at the logs' times: between steps by cubics where they are smooth."""
+        """Sensors (B, steps, sensors) at the logs' times: positions and velocities by cubics, others by
+        lines."""
         smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
         held, between = side
         read = between(sensed[:, :, [self.sensor[n] for n in smooth]])
@@ -211,7 +216,7 @@ class Runs:
 
 
 def _carried_out(logs: Sequence[Recording], held: Held, late: float) -> Held:
-    """How commands are held that come `late` [s], and at times of their own where logs have such."""
+    """How commands are held that come `late` [s], and at times of their own where logs have these."""
     since = held.since
     if ACTS in logs[0].columns:
         own = np.array([log[ACTS] - log.t[0] for log in logs])
@@ -223,6 +228,6 @@ def _carried_out(logs: Sequence[Recording], held: Held, late: float) -> Held:
 
 
 def _commanded(log: Recording, column: str) -> np.ndarray:
-    """A command's values, and where a log has it the one that follows the last."""
+    """A command's values, followed where a log has it by the one after the last."""
     following = log.columns.get(f"{ACTS}{column}")
     return log[column] if following is None else np.append(log[column], following[-1])

@@ -1,7 +1,7 @@
-"""What of a MuJoCo model can be set, by names such as `joint:elbow.damping`, and a model with some changed.
+"""Settings of a MuJoCo model by names such as `joint:elbow.damping`, and a model with some changed.
 
-A setting is a field of the compiled model, set in place and restored, or a parameter that no field holds: of
-a law that MuJoCo lacks (`laws.py`), or of how commands are held between samples (`runs.py`).
+A setting is a field of the compiled model, set in place and restored, or a parameter of what MuJoCo lacks: a
+law (`laws.py`), or how commands are held between samples (`runs.py`).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from simgap.simulators.mjcf.engine import FREE, HINGE, mujoco
 
 Put = Callable[[Any, float], None]
 OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
-FADE = "fade"  # a law of an actuator
+FADE = "fade"  # a law of actuators
 HOLD = "option.hold"  # how commands are held between samples: 0 in steps, 1 in lines to the next
-LATE = "option.late"  # by which share of a step they come later
+LATE = "option.late"  # share of a step by which commands come later
 
 
 @dataclass(frozen=True)
 class Setting:
     """One quantity that can be set: its `nominal` value, and `put(model, value)`, which sets it.
 
-    `derived`: whether constants derived from it (mj_setConst) must be recomputed. `stored`: whether MuJoCo
-    writes it. `mixed`: what comes only in whole steps is interpolated between two runs, without it and with
-    it at this value.
+    `derived`: whether constants derived from it (mj_setConst) must be recomputed; `stored`: whether MuJoCo
+    writes it to XML; `mixed`: of what comes in whole steps only, the value whose run is interpolated with the
+    nominal one.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Setting:
 
 
 def object_id(model: Any, kind: str, name: str) -> int:
-    """Index of an object; KeyError where there is none of that name."""
+    """Index of an object; KeyError where none has that name."""
     found = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if found < 0:
         raise KeyError(name)
@@ -55,14 +55,14 @@ def name_of(model: Any, kind: str, number: int) -> str:
 
 
 def names_of(model: Any, kind: str) -> list[str]:
-    """Names of all objects of a kind, those without one left out."""
+    """Names of all objects of a kind that have one."""
     count = model.nu if kind == "actuator" else getattr(model, {"joint": "njnt"}.get(kind, f"n{kind}"))
     return [name for name in (name_of(model, kind, i) for i in range(count)) if name]
 
 
 def payload_place(model: Any, name: str) -> np.ndarray:
-    """Where a body carries a load (3,) [m], in its frame: at its farthest site, where it has one, else at the
-    farthest centre of its geoms; at its centre of mass if it has none."""
+    """Where a body carries a load (3,) [m], in its frame: its farthest site, else the farthest centre of its
+    geoms, else its centre of mass."""
     b = object_id(model, "body", name)
     for places, owner in ((model.site_pos, model.site_bodyid), (model.geom_pos, model.geom_bodyid)):
         mine = np.array(places[np.asarray(owner) == b])
@@ -72,7 +72,7 @@ def payload_place(model: Any, name: str) -> np.ndarray:
 
 
 def most_of(model: Any, actuator: int) -> float:
-    """The largest force that an actuator can give, 0 where the model states none."""
+    """The largest force of an actuator; 0 where the model states none."""
     if model.actuator_forcelimited[actuator]:
         return float(np.abs(model.actuator_forcerange[actuator]).max())
     if model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator, 1]:
@@ -82,7 +82,7 @@ def most_of(model: Any, actuator: int) -> float:
 
 
 def compiled(spec: Any) -> Any:
-    """The model of an MjSpec, such that gravity compensation can be set where the spec has none."""
+    """Compile an MjSpec such that gravity compensation can be set where the spec has none."""
     own = [body.gravcomp for body in spec.bodies]
     for body in spec.bodies:
         body.gravcomp = 1.0
@@ -97,7 +97,7 @@ def nothing(model: Any, value: float) -> None:
 
 
 def _to(array: str, at: Any, factor: float | np.ndarray = 1.0) -> Put:
-    """Set an entry of one of the model's arrays."""
+    """A setter of an entry of one of the model's arrays."""
 
     def put(model: Any, value: float) -> None:
         getattr(model, array)[at] = factor * value
@@ -106,13 +106,13 @@ def _to(array: str, at: Any, factor: float | np.ndarray = 1.0) -> Put:
 
 
 def _field(name: str, unit: str, model: Any, array: str, at: Any, derived: bool = False) -> Setting:
-    """Entries of one of the model's arrays, which are alike."""
+    """A setting of equal entries of one of the model's arrays."""
     nominal = float(np.ravel(getattr(model, array)[at])[0])
     return Setting(name, unit, nominal, _to(array, at), derived)
 
 
 def _larger(model: Any, *entries: tuple[str, Any]) -> Put:
-    """Set entries to 1 + value times what they are in the model."""
+    """A setter of entries to 1 + value times what the model has."""
     own = [(array, at, np.array(getattr(model, array)[at])) for array, at in entries]
 
     def put(m: Any, value: float) -> None:
@@ -213,8 +213,8 @@ def _actuator(model: Any, name: str, attribute: str) -> Setting | None:
 
 
 def _option(model: Any, _: str, attribute: str) -> Setting | None:
-    """tilt_x, tilt_y (gravity turned about the world's axes [rad]), timestep (relative), iterations (0: as it
-    is, 1: ten times), and what acts on commands."""
+    """tilt_x, tilt_y (gravity rotated about the world's axes [rad]), timestep (relative), iterations (0: as
+    in the model, 1: ten times), and how commands are held."""
     down, step, count = np.array(model.opt.gravity), float(model.opt.timestep), int(model.opt.iterations)
     whole, axis = f"option.{attribute}", np.eye(3)[int(attribute == "tilt_y")]
 
@@ -239,8 +239,7 @@ def _option(model: Any, _: str, attribute: str) -> Setting | None:
 
 
 def _drive(model: Any, _: str, attribute: str) -> Setting | None:
-    """gravity_compensation: the share of the weights that drives carry by themselves, of all bodies that
-    are not free."""
+    """gravity_compensation: the share of the weights of all bodies that are not free, carried by drives."""
     roots = np.asarray(model.body_rootid)
     first = np.asarray(model.body_jntadr)[roots]
     free = np.array([j >= 0 and int(model.jnt_type[j]) == FREE for j in first])
@@ -307,7 +306,7 @@ FIELDS = (
 def changed_model(
     model: Any, settings: Mapping[str, Setting], values: Sequence[tuple[str, float]]
 ) -> Iterator[None]:
-    """Within it the model has some settings changed."""
+    """Change some settings of a model within the context."""
     if not values:
         yield
         return

@@ -1,4 +1,4 @@
-"""The recorded motion: what torques it takes, and how far gears give under them behind an encoder."""
+"""The recorded motion: the torques that it takes, and how far gears give under them behind an encoder."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from simgap.simulators.mjcf.setting import name_of, object_id
 from simgap.simulators.protocol import Channels, Parameter
 from simgap.simulators.recording import Recording
 
-LIGHT = 1e-6  # numerics: N m, m N m: what is less is nothing
-GIVES = 0.01  # prior: of a joint's reach: by how much its gears usually give
-SHARE = 0.03  # prior: of the torques that a joint shows: the usual size of what a model lacks there
+LIGHT = 1e-6  # numerics: m N m: a smaller torque times lever counts as none
+GIVES = 0.01  # prior: share of a joint's reach by which its gears usually give
+SHARE = 0.03  # prior: share of a joint's torques: the usual size of what a model lacks there
 
 
 def elasticity(
@@ -27,9 +27,11 @@ def elasticity(
     motions: Sequence[Motion],
     joints: Sequence[int],
 ) -> list[RobotEffect]:
-    """Gears that give: behind an encoder at the motor, a joint lags by compliance times the torque that it
-    transmits, which moves what is read of bodies and sites beyond it. Slow against the gear's own ringing, as
-    motions are."""
+    """Candidates of gears that give behind an encoder at the motor.
+
+    A joint lags by compliance times the torque transmitted, which moves bodies and sites beyond it as they
+    are read. Valid for motion slow against the gear's own ringing.
+    """
     model, data = simulator.model, mujoco.MjData(simulator.model)
     columns = simulator.map.columns
     seen = {n: m for n, m in columns.items() if m.thing in ("site", "body") and m.axis in ("x", "y", "z")}
@@ -68,13 +70,13 @@ def elasticity(
 
 
 def _of_motor(model: Any, motion: Motion, joint: int) -> np.ndarray:
-    """Torque (n,) that a joint's own rotor and damping take [N m], before what it moves."""
+    """Torque (n,) [N m] that a joint's rotor and damping take, before what it moves."""
     dof = int(model.jnt_dofadr[joint])
     return model.dof_armature[dof] * motion.acceleration[joint] + model.dof_damping[dof] * motion.rate[joint]
 
 
 class Sizes(NamedTuple):
-    """What a joint shows along the logs, root mean squares."""
+    """Root mean squares of a joint's motion along the logs."""
 
     torque: float
     rate: float
@@ -83,7 +85,7 @@ class Sizes(NamedTuple):
 
 
 def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
-    """Sizes of one joint's motion along all logs."""
+    """Sizes of a joint's motion along all logs."""
 
     def rms(values: Iterable[np.ndarray], least: float = 1e-6) -> float:
         return max(float(np.sqrt(np.mean(np.concatenate([*values]) ** 2))), least)
@@ -98,7 +100,7 @@ SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic
 
 @dataclass(frozen=True)
 class Motion:
-    """By joint, along a log's samples: position, rate, acceleration and the torque that they take (n,)."""
+    """By joint, along a log's samples (n,): position, rate, acceleration and the torque that they take."""
 
     position: dict[int, np.ndarray]
     rate: dict[int, np.ndarray]
