@@ -111,4 +111,3 @@ def _blocks(properties: Any, task: BlockTask) -> Blocks:
     if isinstance(properties, str | Path):
         return read_properties(properties, task)
     return properties
-

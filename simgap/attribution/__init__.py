@@ -1,1 +1,1 @@
-"""Which of many candidate effects explain a gap: mathematics that knows of no simulator and no hand."""
+"""Which of many candidate effects explain a gap: statistics that know of no simulator and no hand."""

@@ -1,4 +1,4 @@
-"""The attribution of a gap: which effects act, how sure, what share each explains, and what is left."""
+"""The attribution of a gap: which effects act, how surely, what share each explains, and what is left."""
 
 from __future__ import annotations
 
@@ -36,23 +36,32 @@ from simgap.attribution.verdict import (
     significant,
 )
 
-# What an attribution finds, as frozen objects.
+# The result.
 
 
 @dataclass(frozen=True)
 class ParameterPosterior:
-    """Mean, standard deviation and 90 % interval, given that the effect acts."""
+    """Mean and standard deviation of a parameter, given that the effect acts."""
 
     mean: float
     sd: float
-    interval_90: tuple[float, float]
+
+    @property
+    def interval_90(self) -> tuple[float, float]:
+        """The central 90 % interval of a normal distribution."""
+        return self.mean - 1.645 * self.sd, self.mean + 1.645 * self.sd
 
 
 @dataclass(frozen=True)
 class EffectPosterior:
-    """One effect: `probability` to act, `share` of the gap it explains with its 90 % interval (0 where it
-    does not act), parameters, and which of the gap's candidates (an effect may have several forms) they are
-    of."""
+    """The posterior of one effect.
+
+    Attributes:
+        probability: To act.
+        share, share_90: Share of the gap it explains, with its 90 % interval; 0 if it does not act.
+        parameters: By name.
+        candidate: Index of the candidate they belong to (an effect may have several).
+    """
 
     probability: float
     share: float
@@ -63,7 +72,7 @@ class EffectPosterior:
 
 @dataclass(frozen=True)
 class Remainder:
-    """What no named cause explains: its `share` of the gap, the chance of noise to look so, and where."""
+    """What no named cause explains: its share of the gap, its p-value as noise, and its cells."""
 
     share: float
     p_value: float
@@ -72,21 +81,34 @@ class Remainder:
 
 @dataclass(frozen=True)
 class SmallGap:
-    """A gap below the smallest that matters: `size` over that, of the `channel` and `part` with the most;
-    `amount` there in sds of the noise, for the caller to turn into units."""
+    """A gap too small to matter, at its largest among channels and parts of trials.
+
+    Attributes:
+        size: The gap over the smallest that matters.
+        channel: The channel in which it is largest.
+        amount: Its root mean square there, in standard deviations of the noise.
+    """
 
     size: float
     channel: str
-    part: str
     amount: float
 
 
 @dataclass(frozen=True)
 class Attribution(Verdict):
-    """The verdict, with everything else that was found; see the fields' own classes.
+    """The verdict and everything it rests on.
 
-    `left` (n,): residual that the causes leave, `before` (n,): with nuisances alone, both as cosines of each
-    cell.
+    Attributes:
+        effects: Posterior of each effect.
+        detection: The test for a gap.
+        remainder: What the causes do not explain.
+        where: Cells of the gap.
+        how_far: How far it shrinks on held-out trials; None if not evaluated.
+        small_gap: The gap if it is too small to matter.
+        noise: Standard deviation of each channel's noise over the stated one.
+        models: The sets of effects that were considered.
+        shares: Shares of the gap by effect.
+        before, left: Residuals (n,) with nuisances alone and with the causes, as cosines of each cell.
     """
 
     effects: dict[str, EffectPosterior]
@@ -102,16 +124,17 @@ class Attribution(Verdict):
     left: np.ndarray
 
 
-# Noise of each channel over the stated one, and gaps too small to matter.
+# Noise of each channel relative to the stated one, and gaps too small to matter.
 
-STATED = (0.6, 1.7)  # prior: bounds of a channel's noise over the stated one, in standard deviations
+STATED = (0.6, 1.7)  # prior: bounds of a channel's noise relative to the stated one
 
 
 def noise_of(f: Forms, model: Model) -> np.ndarray:
-    """Noise (channels,) over the stated one, sd: the median of the groups that a set leaves, by their counts.
+    """Standard deviation (channels,) of the noise that a set leaves, relative to the stated one.
 
-    Groups where the model is off by itself are few: a median does not see them. Each is measured by the
-    median of as many squares of noise, which is less than their mean (Wilson & Hilferty, PNAS 17, 1931).
+    The weighted median over groups: it ignores the few groups in which the model itself is off. The mean
+    square of a group is divided by the median expected from as many squares of noise, which is below their
+    mean (Wilson & Hilferty, PNAS 17, 1931).
     """
     count = np.maximum(f.count, 1)
     channel, ratio = channel_of(f), model.energy / (count * (1 - 2 / (9 * count)) ** 3)
@@ -126,7 +149,7 @@ def noise_of(f: Forms, model: Model) -> np.ndarray:
 
 
 def stated(rows: Rows) -> np.ndarray:
-    """The noise (channels,) that rows are measured by, over the stated one."""
+    """Standard deviation (channels,) of the noise by which rows are whitened, over the stated one."""
     out = np.ones(len(rows.channels))
     for c in np.unique(rows.channel) if rows.sd is not None else ():
         out[c] = np.sqrt(np.mean(rows.sd[rows.channel == c] ** 2))  # type: ignore[index]
@@ -134,10 +157,16 @@ def stated(rows: Rows) -> np.ndarray:
 
 
 def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap:
-    """The gap's size, over what matters least, where it is largest."""
+    """Size of the gap relative to the tolerance, where it is largest.
+
+    Args:
+        f: Quadratic forms of the gap.
+        by_group: Variance (G,) of each group's noise.
+        tolerance: Smallest shift (n,) of each row that matters.
+    """
     before = residual_left(f, fitted(f, ()))
     rows = f.gap.rows
-    key, inverse = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
+    inverse = rows.place
     count = np.bincount(inverse).astype(float)
     noise = by_group[f.spectrum.group]
     excess = np.maximum(np.bincount(inverse, before**2) - np.bincount(inverse, noise), 0.0) / count
@@ -147,12 +176,13 @@ def small_gap(f: Forms, by_group: np.ndarray, tolerance: np.ndarray) -> SmallGap
     amount, least = amount * sd, np.bincount(inverse, tolerance) / count
     size = amount / least
     most = int(size.argmax())
-    channel, part = divmod(int(key[most]), len(rows.parts))
-    return SmallGap(float(size[most]), rows.channels[channel], rows.parts[part], float(amount[most]))
+    channel = rows.channels[rows.channel[inverse == most][0]]
+    return SmallGap(float(size[most]), channel, float(amount[most]))
 
 
-DOUBT = 0.1  # chosen: chance of no cause or another one, beyond which a gap usually tolerated is left
-EXAMINED = 6  # numerics: sets that are examined for being the cause
+# chosen: probability of no or another cause above which a gap within the default tolerance is ignored
+DOUBT = 0.1
+EXAMINED = 6  # numerics: sets that are examined as causes
 
 
 def attribute(
@@ -166,11 +196,18 @@ def attribute(
 ) -> Attribution:
     """Attribute a gap to its candidates.
 
-    `twins`: the `statistic` of healthy twins, taken one by one, or what gives them for the gap's own; without
-    them stated noise is the null. `absorbed`: by how much the first nuisances may be off without it
-    mattering. `forced` names effects that act for certain, and no others. `heldout`: whether causes must
-    shrink the gap of trials that took no part, where there are several. `models`: the sets that `sought`
-    finds, where they are known already.
+    Args:
+        gap: The gap.
+        twins: Statistics of healthy twins, drawn one by one, or a function of the gap's own statistic that
+            gives them. Without twins the stated noise is the null.
+        forced: Effects that act for certain; no others do.
+        seed: Of the draws behind intervals.
+        heldout: Whether causes must shrink the gap of held-out trials, if there are several trials.
+        models: Result of `sought`, if known.
+        absorbed: Shifts of the first nuisances that do not matter.
+
+    Raises:
+        InputError: A forced effect is not among the candidates.
     """
     rng = np.random.default_rng(seed)
     f = forms(gap)
@@ -178,46 +215,46 @@ def attribute(
     if forced:
         models = [_forced(f, forced), *[m for m in models if not m.effects]]
     value = statistic(f, models)
-    found = detected(value, twins(value) if callable(twins) else twins)
-    w = weights(models)
+    detection = detected(value, twins(value) if callable(twins) else twins)
     noise = noise_of(f, models[0])
     by_group = (noise**2)[channel_of(f)]
     ranked, others = [m.effects for m in models if m.effects][:EXAMINED], None
-    if heldout and (found.p_value < ALARM or forced):
+    if heldout and (detection.p_value < ALARM or forced):
         others = Heldout.of(f, noise**2, (j for effects in ranked for j in effects))
     examined = {effects: _examined(f, effects, models, by_group, rng, others) for effects in ranked}
-    sets = [_explanation(f, m.effects, float(x), examined) for m, x in zip(models, w, strict=True)]
+    sets = [
+        _explanation(f, m.effects, float(x), examined) for m, x in zip(models, weights(models), strict=True)
+    ]
     small = None
-    if gap.tolerance is not None and (found.p_value < ALARM or forced):
+    if gap.tolerance is not None and (detection.p_value < ALARM or forced):
         small = _small(f, models, by_group, absorbed)
-    if small is not None and gap.usual:  # a cause that is surely found can be mended
-        chance = probabilities(sets, found.p_value)
+    if small is not None and gap.usual:  # a cause that is certain can be mended
+        chance = probabilities(sets, detection.p_value)
         small = small if chance["none"] + chance["unknown"] > DOUBT else None
     first = next(iter(examined), ())
     named = _names(f, first) if forced else ()
-    verdict = conclude(sets, found.p_value, small is None, named, unseen=found.unseen)
-    causes = next((j.causes for j in examined.values() if _names(f, j.causes) == verdict.causes), ())
+    verdict = conclude(sets, detection.p_value, small is None, named, unseen=detection.unseen)
+    causes = next((one.causes for one in examined.values() if _names(f, one.causes) == verdict.causes), ())
     causes = first if forced else causes
     model = fitted(f, causes)
     left, before = residual_left(f, model), residual_left(f, fitted(f, ()))
     sd = noise[gap.rows.channel]
-    rest = significant(gap.rows, f.spectrum.band, left, sd)
+    unexplained = significant(gap.rows, f.spectrum.band, left, sd)
     p_rest = detected(statistic(f, models, causes)).p_value
     explained = shares(f, model, by_group, rng)
-    # Noise that differs from part to part can show a gap somewhere, and none in all squares together.
+    # If noise differs between parts a gap may show in one place but not in the total.
     shown = explained.before > explained.floor or verdict.verdict == "none"
     remains = explained.remainder if shown else 1.0
-    far = None if others is None else others.how_far(causes)
-    chance = acting([Explanation(_names(f, m.effects), float(x)) for m, x in zip(models, w, strict=True)],
-                    found.p_value)  # fmt: skip
+    shrinkage = None if others is None else others.how_far(causes)
+    chance = acting(sets, detection.p_value)
     somewhere = verdict.verdict != "none" or small is not None
     return Attribution(
         **vars(verdict),
         effects=_effects(f, models, chance, examined),
-        detection=found,
-        remainder=Remainder(remains, p_rest, rest),
+        detection=detection,
+        remainder=Remainder(remains, p_rest, unexplained),
         where=significant(gap.rows, f.spectrum.band, before, sd) if somewhere else (),
-        how_far=far,
+        how_far=shrinkage,
         small_gap=small,
         noise=dict(zip(gap.rows.channels, (noise * stated(gap.rows)).tolist(), strict=True)),
         models=tuple(models),
@@ -228,12 +265,14 @@ def attribute(
 
 
 def _names(f: Forms, effects: Iterable[int]) -> tuple[str, ...]:
+    """Names of candidates, sorted."""
     return tuple(sorted({f.gap.candidates[j].name for j in effects}))
 
 
 def _explanation(
     f: Forms, effects: tuple[int, ...], weight: float, examined: dict[tuple[int, ...], _Examined]
 ) -> Explanation:
+    """A set as an explanation; without causes if it was not examined."""
     one = examined.get(effects)
     if one is None:
         return Explanation(_names(f, effects), weight)
@@ -243,7 +282,9 @@ def _explanation(
 def _small(
     f: Forms, models: list[Model], by_group: np.ndarray, absorbed: np.ndarray | None
 ) -> SmallGap | None:
-    """The gap's size where neither residuals, nor what is likely, nor the properties it moves matter."""
+    """The gap's size if it does not matter: neither residuals, nor their statistic, nor shifts of properties
+    do.
+    """
     assert f.gap.tolerance is not None
     small = small_gap(f, np.minimum(by_group, 1.0), f.gap.tolerance)
     if small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM:
@@ -256,7 +297,11 @@ def _small(
 
 
 def _forced(f: Forms, names: tuple[str, ...]) -> Model:
-    """The best set of these effects, one form of each; InputError for one that cannot act here."""
+    """The best fit of the given effects, one form of each.
+
+    Raises:
+        InputError: An effect is not among the candidates.
+    """
     possible = dict.fromkeys(c.name for c in f.gap.candidates)
     for name in names:
         if name not in possible:
@@ -268,9 +313,15 @@ def _forced(f: Forms, names: tuple[str, ...]) -> Model:
 
 @dataclass(frozen=True)
 class _Examined:
-    """A set of effects: its fit, shares, `causes` that matter, probability to be right."""
+    """A set of effects examined as the cause.
 
-    effects: tuple[int, ...]
+    Attributes:
+        model: The fitted set.
+        shares: Shares of its effects.
+        causes: Those effects that matter.
+        known: Probability that they are the cause.
+    """
+
     model: Model
     shares: Shares
     causes: tuple[int, ...]
@@ -285,7 +336,10 @@ def _examined(
     rng: np.random.Generator,
     others: Heldout | None = None,
 ) -> _Examined:
-    """`others`: trials predicted by the others; a cause must predict them better than the set without it."""
+    """Decide which effects of a set are its causes, and how probable it is that they are the cause.
+
+    With held-out trials (`others`) a cause must predict them better than the set without it does.
+    """
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
@@ -294,19 +348,19 @@ def _examined(
         causes = _predicting(others, causes)
     shifting = {*causes} - scattering
     left = explained.inside if shifting else 0.0
-    far = None if others is None else others.how_far(causes)
-    share = 1 - explained.remainder if far is None else far.fraction
-    if far is None and others is not None and shifting:
-        share = 0.0  # squares in all are no more than the noise's: there is nothing that could be gone
+    shrinkage = None if others is None else others.how_far(causes)
+    share = 1 - explained.remainder if shrinkage is None else shrinkage.fraction
+    if shrinkage is None and others is not None and shifting:
+        share = 0.0  # the held-out trials show no gap to explain
     sure = known(left, share, detected(statistic(f, models, causes)).p_value) if causes else 0.0
-    return _Examined(effects, model, explained, causes, sure)
+    return _Examined(model, explained, causes, sure)
 
 
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
-    """Causes without which held-out trials are predicted worse, the others removed one at a time.
+    """Drop causes without which held-out trials are predicted no worse, one at a time.
 
-    The trial that gains most does not count: an accident of one trial is no cause. An effect that only
-    scatters must gain more than form errors of the rest may feign.
+    The trial that gains most does not count: an accident of one trial is no cause. A random effect must gain
+    more than errors in the forms of the others may imitate.
     """
     of = others.whole.gap.candidates
     while causes:
@@ -326,8 +380,11 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _needed(f: Forms, model: Model, effect: int) -> bool:
-    """Whether the evidence of a set rules out that its other effects do without this one, by more than errors
-    in their forms may feign. One alone is needed if there is a gap."""
+    """Whether an effect of a set is needed.
+
+    Its evidence must exceed RULED_OUT and what errors in the forms of the other effects may imitate. A single
+    effect is needed if there is a gap.
+    """
     others = tuple(j for j in model.effects if j != effect)
     if not others:
         return True
@@ -338,16 +395,16 @@ def _needed(f: Forms, model: Model, effect: int) -> bool:
 def _effects(
     f: Forms, models: list[Model], chances: dict[str, float], examined: dict[tuple[int, ...], _Examined],
 ) -> dict[str, EffectPosterior]:  # fmt: skip
-    """The posterior of every candidate: from the best set that holds it, or by itself."""
+    """Posterior of every effect, from the best set that has it, else from a fit of it alone."""
     out: dict[str, EffectPosterior] = {}
     forms_of: dict[str, list[int]] = {}
     for j, c in enumerate(f.gap.candidates):
         forms_of.setdefault(c.name, []).append(j)
     for name, mine in forms_of.items():
         inside = [m for m in models if {*mine} & {*m.effects}]
-        found = next((one for part, one in examined.items() if {*mine} & {*part}), None)
-        if found is not None:
-            model = found.model
+        examination = next((one for part, one in examined.items() if {*mine} & {*part}), None)
+        if examination is not None:
+            model = examination.model
         elif inside:
             model = inside[0]
         else:
@@ -355,23 +412,22 @@ def _effects(
         j = next(iter({*mine} & {*model.effects}))
         c = f.gap.candidates[j]
         share, interval = 0.0, (0.0, 0.0)
-        if found is not None:
-            share, interval = found.shares.of_effect(found.effects.index(j))
+        if examination is not None:
+            share, interval = examination.shares.of_effect(examination.model.effects.index(j))
         own = coordinates(f, model.effects)[j]
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
         wide = np.hypot(sd, c.scale * RESPONSE * share_of(f, model, j))
-        if found is not None:  # parts are compared for effects of the sets that were examined alone
+        if examination is not None:  # only examined sets are compared between parts
             wide = np.hypot(wide, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,
-            {n: ParameterPosterior(float(m), float(s), (float(m - 1.645 * s), float(m + 1.645 * s)))
+            {n: ParameterPosterior(float(m), float(s))
              for n, m, s in zip(c.parameters, mean, wide, strict=True)}, j)  # fmt: skip
     return out
 
 
 def _between(f: Forms, model: Model, effect: int) -> np.ndarray:
-    """Variance (k,) of an effect's deviations over scale, for trials differ, or channels and subtasks."""
+    """Additional variance (k,) of scaled deviations, between trials or between channels and subtasks."""
     rows = f.gap.rows
-    _, place = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
-    return np.maximum(*(scatter_between(f, model, effect, part) for part in (rows.trial, place)))
+    return np.maximum(*(scatter_between(f, model, effect, part) for part in (rows.trial, rows.place)))

@@ -1,8 +1,8 @@
 """Which effects act together: a spike-and-slab posterior over sets of candidates.
 
-Every set's evidence is Laplace's approximation about its mode, found by iteratively reweighted least
-squares: groups of rows count by their expected precision under the background (`background`), parameters by
-that of their Cauchy prior. `search` finds the sets.
+The evidence of a set is Laplace's approximation about its mode, found by iteratively reweighted least
+squares: groups of rows are weighted by their expected precision under the background, parameters by that of
+their Cauchy prior. `simgap.attribution.search` finds the sets.
 """
 
 from __future__ import annotations
@@ -14,35 +14,35 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit, gammaln
 
-from simgap.attribution.problem import Candidate, Gap, Spectrum, cosines, spectrum
+from simgap.attribution.problem import Gap, Spectrum, cosines, spectrum
 from simgap.bounded import least
 
-# The background: what no candidate explains, by group of rows, with a variance of its own.
+# The background: what no candidate explains, a variance of its own for each group of rows.
 #
-# The rows of a group (a channel in a part, in a band) have variance phi, one as a rule. Beforehand log phi is
+# The rows of a group (a channel in a part, in a band) have variance phi, usually one. The prior of log phi is
 # normal, as stated noise is a little off, and with some probability log-uniform above that: there the model
-# is off for reasons of its own. By what does not matter (a tolerance) any group is as likely off as not.
-# Averaged over phi, what a group's squares say grows with their logarithm only, so that no group decides
-# alone (a scale mixture of normals: West, Biometrika 74, 1987).
+# is off for reasons of its own. A group is as likely as not off by less than the tolerance. Averaged over
+# phi, the log density of a group grows only with the logarithm of its squares, so that no group decides alone
+# (a scale mixture of normals: West, Biometrika 74, 1987).
 
-STATED = 0.3  # prior: sd of log variance about the stated one: noise stated to 15 %
-OFF = 0.1  # prior: share of groups, beforehand, in which the model is off by itself
-WITHIN = 0.5  # prior: share of groups in which it is off by less than matters
+STATED = 0.3  # prior: sd of log variance about the stated one: noise is stated to 15 %
+OFF = 0.1  # prior: share of groups in which the model is off
+WITHIN = 0.5  # prior: share of groups in which it is off by less than the tolerance
 NEAR, FAR = 13, 20  # numerics: points of the grid
-NEAR_BY = 3.5 * STATED  # numerics: log variance between the two parts of the grid
-LARGEST = 1e6  # numerics: the most that a variance exceeds the stated one
+NEAR_BY = 3.5 * STATED  # numerics: log variance that separates the two parts of the grid
+LARGEST = 1e6  # numerics: largest variance over the stated one
 
 
 @dataclass(frozen=True)
 class Background:
-    """A grid of log variances and the log of their prior weights; `plain` knows no background at all."""
+    """A grid of log variances (grid,) and the logarithms of their prior weights (grid,)."""
 
     log_phi: np.ndarray
     log_prior: np.ndarray
 
     @classmethod
     def usual(cls, stated: float = STATED, off: float = OFF) -> Background:
-        """Stated noise, or the model off."""
+        """Noise about as stated, or the model off."""
         grid = np.concatenate(
             [np.linspace(-3, 3, NEAR) * stated, np.linspace(4 * stated, np.log(LARGEST), FAR)]
         )
@@ -58,11 +58,11 @@ class Background:
         return cls(np.zeros(1), np.zeros(1))
 
     def tolerant(self, most: np.ndarray) -> np.ndarray:
-        """The log prior (grid, G) of groups whose variance may be so much (G,) without it mattering."""
+        """Log prior (grid, G) of groups whose variance may reach `most` (G,) without it mattering."""
         inside = (self.log_phi[:, None] > NEAR_BY) & (self.log_phi[:, None] <= np.log(most))
         number = inside.sum(0)
         share = np.where(number > 0, WITHIN, 0.0)
-        # What is beyond any tolerance stays as likely as it was.
+        # Variances beyond the tolerance keep their prior.
         usual = self.log_phi <= NEAR_BY
         taken = share * np.exp(self.log_prior[usual]).sum()
         with np.errstate(divide="ignore"):
@@ -77,9 +77,17 @@ class Background:
         shift: np.ndarray | float = 0.0,
         most: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (G,) of groups with these squares and counts, but for (2 pi)^(-count/2), and their
-        expected precisions (G,). `shift`: log variance that the groups have in any case; `most` (G,): the
-        variance that does not matter."""
+        """Integrate out the variances of groups.
+
+        Args:
+            energy: Sum of squares (G,) of each group.
+            count: Number of rows (G,).
+            shift: Log variance that the groups have in any case.
+            most: Variance (G,) up to which it does not matter; None for no tolerance.
+
+        Returns:
+            Log density (G,) up to (2 pi)^(-count/2), and expected precision (G,).
+        """
         log_phi = self.log_phi[:, None] + shift
         precision = np.exp(-log_phi)
         prior = self.log_prior[:, None] if most is None else self.tolerant(most)
@@ -90,14 +98,14 @@ class Background:
         return peak + np.log(total), (weight * precision).sum(axis=0) / total
 
 
-# What the sensors' noise adds to the products of a gap's columns, to be taken off again.
+# What sensor noise adds to the products of a gap's columns, to be subtracted again.
 #
-# An effect takes a recording back, noise and all: softer pads bring more of the force's noise into a
-# distance, a force read between two samples has less of it. Its columns are noisy, then, and by noise alone a
-# set of effects may leave smaller squares than none (errors in variables). Each product of two columns is in
-# expectation that of their noiseless parts and that of their noises; the second is known and subtracted: the
-# moments' correction of Fuller (Measurement Error Models, 1987), a corrected score (Nakamura, Biometrika 77,
-# 1990). It needs no residual to be free of other errors, as a likelihood of both variables does.
+# An effect corrects a recording, noise included: softer pads bring more of the force's noise into a distance,
+# a force read between two samples has less of it. Columns of effects are therefore noisy, and by noise alone
+# a set of effects may leave smaller squares than none (errors in variables). The expectation of a product of
+# two columns is that of their noiseless parts plus that of their noises; the second is known and subtracted:
+# the moment correction of Fuller (Measurement Error Models, 1987), a corrected score (Nakamura, Biometrika
+# 77, 1990). Unlike a likelihood of both variables it does not need residuals free of other errors.
 
 
 def products(columns: np.ndarray, group: np.ndarray) -> np.ndarray:
@@ -112,10 +120,10 @@ def products(columns: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 
 def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
-    """The noise's part (G, M, M) of the products of a spectrum's columns, the residual's own square left out.
+    """Part (G, M, M) of the products of a spectrum's columns that is due to noise.
 
-    Of second order in deviations from where effects were linearised it is left out, too: no curvature is
-    taken off, so that every mode stays a maximum.
+    The square of the residual is left out, and so are terms of second order in deviations from the point of
+    linearisation: without a change of curvature every mode stays a maximum.
     """
     assert gap.carried is not None
     rows, columns = gap.rows, gap.carried
@@ -128,7 +136,7 @@ def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
     slopes[[0, *(mine[0] for mine in gap.own_columns)]] = False
     out[:, slopes[:, None] & slopes] = 0.0
     out[:, 0, 0] = 0.0
-    turn = gap.to_constant  # differs from one in columns of shifts alone
+    turn = gap.to_constant  # the identity except in columns of shifts
     shifts = [mine[0] for mine in gap.own_columns]
     turned = turn[:, shifts]
     out[:, :, shifts] = out @ turned
@@ -136,17 +144,22 @@ def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
     return out
 
 
-STEPS = 30  # numerics: of an iteration, at most
+STEPS = 30  # numerics: most iterations
 CLOSE = 0.02  # numerics: nats
 
 
 @dataclass(frozen=True)
 class Model:
-    """One set of effects: its log posterior (unnormalised), and the mode of its parameters.
+    """A fitted set of effects.
 
-    `effects`: indices of candidates, ascending; `x` (K + sum k,): nuisances, then each effect's deviations
-    over scale; `covariance` of x; `energy` (G,), `precision` (G,) of the groups at the mode; `at_bound`
-    marks coordinates held at a bound.
+    Attributes:
+        effects: Indices of its candidates, ascending.
+        score: Unnormalised log posterior [nats].
+        x: Mode (K + sum k,) of the nuisances, then of each effect's scaled deviations.
+        covariance: Of x.
+        energy: Sum of squares (G,) of each group at the mode.
+        precision: Expected precision (G,) of each group.
+        at_bound: Which coordinates are held at a bound.
     """
 
     effects: tuple[int, ...]
@@ -160,9 +173,16 @@ class Model:
 
 @dataclass(frozen=True)
 class Forms:
-    """Quadratic forms of a gap by group: products (G, M, M) of the spectrum's columns, counts (G,).
+    """Quadratic forms of a gap by group, shared by all sets of candidates.
 
-    `lenient`: a group is as likely as not off by what does not matter. `modes`: sets fitted so far.
+    Attributes:
+        gap: The gap.
+        spectrum: Its cosine transform.
+        background: Prior of the groups' variances.
+        product: Products (G, M, M) of the spectrum's columns.
+        count: Expected squares (G,) if nothing acts.
+        lenient: Whether groups are as likely as not off by less than the tolerance.
+        modes: Sets fitted so far.
     """
 
     gap: Gap
@@ -174,7 +194,7 @@ class Forms:
     modes: dict[tuple[int, ...], Model] = field(init=False, default_factory=dict)
 
     def triangle(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """Products (G, P) of pairs of columns, twice those of two different ones."""
+        """Products (G, P) of pairs of columns, doubled for pairs of different columns."""
         taken = np.take(
             self.product.reshape(self.count.size, -1), first * self.product.shape[1] + second, axis=1
         )
@@ -189,11 +209,7 @@ class Forms:
     @cached_property
     def extra(self) -> np.ndarray:
         """Mean variance (J, G) that each candidate adds to a group."""
-        out = np.zeros((len(self.gap.candidates), self.count.size))
-        for j, c in enumerate(self.gap.candidates):
-            if c.variance is not None:
-                out[j] = np.bincount(self.spectrum.group, c.variance, self.count.size) / self.count
-        return out
+        return self._means([c.variance for c in self.gap.candidates])
 
     def shift(self, effects: tuple[int, ...]) -> np.ndarray:
         """Log variance (G,) that a set's effects give to the groups."""
@@ -201,19 +217,28 @@ class Forms:
 
     @cached_property
     def freed(self) -> np.ndarray:
-        """By how much (J, G) the variance of each group may be larger where a candidate acts."""
-        out = np.zeros((len(self.gap.candidates), self.count.size))
-        for j, c in enumerate(self.gap.candidates):
-            if c.frees is not None:
-                out[j] = np.bincount(self.spectrum.group, c.frees, self.count.size) / self.count
+        """Most additional mean variance (J, G) of each group where a candidate acts."""
+        return self._means([c.frees for c in self.gap.candidates])
+
+    def _means(self, values: Sequence[np.ndarray | None]) -> np.ndarray:
+        """Means (J, G) of each candidate's values (n,) by group; 0 where it has none."""
+        out = np.zeros((len(values), self.count.size))
+        for j, value in enumerate(values):
+            if value is not None:
+                out[j] = np.bincount(self.spectrum.group, value, self.count.size) / self.count
         return out
 
     def marginal(
         self, effects: tuple[int, ...], energy: np.ndarray, background: Background | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (G,) of groups with these squares under a set of effects, and expected precisions.
+        """Log density (G,) of groups with these sums of squares, and their expected precisions (G,).
 
-        An effect frees all of its groups or none, one as likely beforehand as the other.
+        An effect frees all of its groups or none, with equal prior probability.
+
+        Args:
+            effects: The set that acts.
+            energy: Sum of squares (G,) of each group.
+            background: Prior of the groups' variances, if not the usual one.
         """
         shift, background = self.shift(effects), background or self.background
         density, precision = background.marginal(energy, self.count, shift, self.most)
@@ -231,30 +256,30 @@ class Forms:
 
     @cached_property
     def most(self) -> np.ndarray | None:
-        """The variance (G,) of groups that does not matter, where that is allowed for.
+        """Variance (G,) of groups up to which it does not matter; None without a tolerance.
 
-        A channel's part may be off by its tolerance throughout, all of it in one band.
+        A part of a channel may be off by its tolerance throughout, all of it in one band.
         """
         rows, group = self.gap.rows, self.spectrum.group
         if self.gap.tolerance is None or not self.lenient:
             return None
-        _, place = np.unique(rows.channel * len(rows.parts) + rows.part, return_inverse=True)
+        place = rows.place
         square = np.square(self.gap.tolerance / (1.0 if rows.sd is None else rows.sd))
         whole = np.bincount(place, square)[place]
         return 1 + np.bincount(group, whole) / self.count**2
 
     @cached_property
     def log_odds(self) -> float:
-        """Prior log odds of one effect to act."""
+        """Prior log odds of each effect to act."""
         number = len({c.name for c in self.gap.candidates})
         share = min(self.gap.expected / max(number, 1), 0.5)
         return float(np.log(share / (1 - share)))
 
 
 def forms(gap: Gap, background: Background | None = None) -> Forms:
-    """The quadratic forms that all sets of candidates share."""
+    """Compute the quadratic forms that all sets of candidates share."""
     s = spectrum(gap)
-    count = np.bincount(s.group, gap.told).astype(float)
+    count = np.bincount(s.group, gap.mean_square).astype(float)
     product = products(s.columns, s.group)
     if gap.carried is not None:
         product -= of_noise(gap, s)
@@ -262,41 +287,51 @@ def forms(gap: Gap, background: Background | None = None) -> Forms:
 
 
 def channel_of(f: Forms) -> np.ndarray:
-    """The channel (G,) of each group."""
+    """Channel (G,) of each group."""
     out = np.zeros(f.count.size, int)
     out[f.spectrum.group] = f.gap.rows.channel
     return out
 
 
 def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
-    """The set's mode and evidence, the better one of two starts: all groups count alike, and as they would
-    with every effect as it was linearised."""
+    """Find a set's mode and evidence, from two starts; the better one counts.
+
+    Groups are first weighted alike, then as they would be with every effect at its point of linearisation.
+    """
     if effects in f.modes:
         return f.modes[effects]
-    taken = quadratic_forms(f, effects)
-    found = [mode(f, taken, np.ones(f.count.size))]
+    own = quadratic_forms(f, effects)
+    modes = [mode(f, own, np.ones(f.count.size))]
     if effects:
-        x = np.zeros(taken.low.size)
-        for j, mine in taken.blocks.items():
+        x = np.zeros(own.low.size)
+        for j, mine in own.blocks.items():
             c = f.gap.candidates[j]
             x[mine] = (c.at - c.neutral) / c.scale
-        found.append(mode(f, taken, f.marginal(effects, taken.energy(x))[1], x))
-    f.modes[effects] = max(found, key=lambda m: m.score)
+        modes.append(mode(f, own, f.marginal(effects, own.energy(x))[1], x))
+    f.modes[effects] = max(modes, key=lambda m: m.score)
     return f.modes[effects]
 
 
 @dataclass(frozen=True)
 class QuadraticForms:
-    """The quadratic forms of one set by group: square (G,), pull (G, n) and bend of its coordinates x (n,).
+    """The quadratic forms of one set by group, in its n coordinates.
 
-    `bend`: two parts (G, .) of the products' upper triangles, those off the diagonal twice: of the nuisances
-    alone, which all sets have, and what the set's own coordinates add; `pairs` (2, .): their coordinates.
+    Attributes:
+        effects: The set.
+        square: Sum of squares (G,) at zero.
+        pull: Half the negative gradient (G, n).
+        curvature: Upper triangles of the curvature in two parts (G, .), that of the nuisances, which all sets
+            share, and the rest; off-diagonal entries are doubled.
+        pairs: Coordinates (2, .) of each entry of the triangles.
+        low, high: Bounds (n,).
+        blocks: Coordinates of each effect's parameters.
+        shift: Log variance (G,) that the effects give to the groups.
     """
 
     effects: tuple[int, ...]
     square: np.ndarray
     pull: np.ndarray
-    bend: tuple[np.ndarray, np.ndarray]
+    curvature: tuple[np.ndarray, np.ndarray]
     pairs: tuple[np.ndarray, np.ndarray]
     low: np.ndarray
     high: np.ndarray
@@ -304,20 +339,20 @@ class QuadraticForms:
     shift: np.ndarray
 
     def energy(self, x: np.ndarray) -> np.ndarray:
-        """Squares (G,) of what is left at x."""
-        usual, own = self.bend
-        each, known = x[self.pairs[0]] * x[self.pairs[1]], usual.shape[1]
-        return np.maximum(self.square - 2 * self.pull @ x + usual @ each[:known] + own @ each[known:], 0.0)
+        """Sums of squares (G,) of the residual at x."""
+        shared, own = self.curvature
+        each, z = x[self.pairs[0]] * x[self.pairs[1]], shared.shape[1]
+        return np.maximum(self.square - 2 * self.pull @ x + shared @ each[:z] + own @ each[z:], 0.0)
 
     def weighed(self, precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Curvature (n, n) and pull (n,) with groups of these precisions (G,) together."""
+        """Curvature (n, n) and pull (n,) of all groups, weighted by these precisions (G,)."""
         matrix = np.zeros((self.low.size, self.low.size))
-        matrix[self.pairs] = np.concatenate([precision @ part for part in self.bend])
+        matrix[self.pairs] = np.concatenate([precision @ part for part in self.curvature])
         return (matrix + matrix.T) / 2, precision @ self.pull
 
 
 def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
-    """The quadratic forms of one set of effects."""
+    """Assemble the quadratic forms of one set of effects."""
     z, own = f.spectrum.num_nuisances, f.spectrum.own
     free = np.concatenate([np.arange(1, 1 + z), *(own[j][1:] for j in effects)]).astype(int)
     constant = np.array([0, *(own[j][0] for j in effects)])
@@ -326,18 +361,26 @@ def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
     pull = np.einsum("i,gij->gj", sign, f.product[:, constant[:, None], free])
     (first, second), (one, other) = np.triu_indices(z), np.triu_indices(free.size)
     first, second = np.append(first, one[other >= z]), np.append(second, other[other >= z])
-    known = f.of_nuisances.shape[1]
-    bend = f.triangle(free[first[known:]], free[second[known:]])
+    shared = f.of_nuisances.shape[1]
+    curvature = f.triangle(free[first[shared:]], free[second[shared:]])
     limits, blocks = _limits(f, effects, z), coordinates(f, effects)
     return QuadraticForms(
-        effects, square, pull, (f.of_nuisances, bend), (first, second), *limits, blocks, f.shift(effects)
+        effects, square, pull, (f.of_nuisances, curvature), (first, second), *limits, blocks, f.shift(effects)
     )
 
 
 def mode(
     f: Forms, taken: QuadraticForms, precision: np.ndarray, x: np.ndarray | None = None, steps: int = STEPS
 ) -> Model:
-    """Iteratively reweighted least squares from given precisions of the groups."""
+    """Find the mode of a set by iteratively reweighted least squares.
+
+    Args:
+        f: Quadratic forms of the gap.
+        taken: Those of the set.
+        precision: Precisions (G,) of the groups to start from.
+        x: Coordinates to start from; zero if None.
+        steps: Most iterations.
+    """
     z, size = f.spectrum.num_nuisances, taken.low.size
     x = np.zeros(size) if x is None else x
     value, prior, energy = -np.inf, np.ones(size), taken.square
@@ -359,12 +402,12 @@ def mode(
     loose = ~held
     covariance = np.zeros_like(matrix)
     covariance[np.ix_(loose, loose)] = np.linalg.inv(matrix[np.ix_(loose, loose)])
-    score = value + _volume(matrix, loose, z) + _known(f, taken.effects)
+    score = value + _volume(matrix, loose, z) + _log_prior_odds(f, taken.effects)
     return Model(taken.effects, score, x, covariance, energy, precision, held)
 
 
 def coordinates(f: Forms, effects: tuple[int, ...]) -> dict[int, np.ndarray]:
-    """Places of each effect's parameters in a set's x, after those of the nuisances."""
+    """Indices of each effect's parameters in a set's x, after those of the nuisances."""
     out, at = {}, f.spectrum.num_nuisances
     for j in effects:
         k = f.gap.candidates[j].at.size
@@ -374,9 +417,10 @@ def coordinates(f: Forms, effects: tuple[int, ...]) -> dict[int, np.ndarray]:
 
 
 def screened(f: Forms, model: Model, sets: Sequence[tuple[int, ...]]) -> np.ndarray:
-    """Scores of sets after one step from where a set counts its groups, all sums over groups shared.
+    """Scores of sets after one step, with groups weighted as in a fitted set.
 
-    They rank neighbours of the set; the leading ones are then `fitted`.
+    Sums over groups are shared. The scores rank the neighbours of that set; the leading ones are then
+    `fitted`.
     """
     z, (groups, size) = f.spectrum.num_nuisances, f.product.shape[:2]
     summed = (model.precision @ f.product.reshape(groups, -1)).reshape(size, size)
@@ -394,17 +438,18 @@ def screened(f: Forms, model: Model, sets: Sequence[tuple[int, ...]]) -> np.ndar
         combined[k, free] = -x
         for mine in blocks.values():
             matrix[mine, mine] += (1 + mine.size) / (1 + x[mine] @ x[mine]) - prior[mine]
-        found.append(_log_prior(x, z, blocks) + _volume(matrix, ~held, z) + _known(f, effects))
+        found.append(_log_prior(x, z, blocks) + _volume(matrix, ~held, z) + _log_prior_odds(f, effects))
     energy = _energies(f, model, sets, combined)
     each = zip(sets, energy, strict=True)
     return np.array(found) + [f.marginal(effects, mine)[0].sum() for effects, mine in each]
 
 
 def _energies(f: Forms, model: Model, sets: Sequence[tuple[int, ...]], combined: np.ndarray) -> np.ndarray:
-    """Squares (S, G) that S neighbours of a set leave, of columns `combined` (S, M) so.
+    """Sums of squares (S, G) by group of S neighbours of a set, at coefficients `combined` (S, M) of the
+    columns.
 
-    Products of what the set has itself are taken from memory once, and those of what is new once for all
-    neighbours with the same new effects.
+    Products of the set's own columns are read once, and those of new effects once for all neighbours that
+    have the same ones.
     """
     base = np.concatenate(
         [np.arange(1 + f.spectrum.num_nuisances), *(f.spectrum.own[j] for j in model.effects)]
@@ -427,13 +472,13 @@ def _energies(f: Forms, model: Model, sets: Sequence[tuple[int, ...]], combined:
 
 
 def _volume(matrix: np.ndarray, loose: np.ndarray, z: int) -> float:
-    """Log volume of a mode with this curvature, but for the nuisances' (2 pi)^(z/2)."""
+    """Log volume of a mode with this curvature, up to (2 pi)^(z/2) of the nuisances."""
     volume = 0.5 * (loose.sum() - z) * np.log(2 * np.pi)
     return volume - 0.5 * float(np.linalg.slogdet(matrix[np.ix_(loose, loose)])[1])
 
 
-def _known(f: Forms, effects: tuple[int, ...]) -> float:
-    """What speaks for a set beforehand, and in other ways than by its rows [nats]."""
+def _log_prior_odds(f: Forms, effects: tuple[int, ...]) -> float:
+    """Prior log odds of a set and its evidence from other sources [nats]."""
     return sum(f.gap.candidates[j].evidence for j in effects) + len(effects) * f.log_odds
 
 
@@ -446,7 +491,7 @@ def _limits(f: Forms, effects: tuple[int, ...], z: int) -> tuple[np.ndarray, np.
 
 
 def _log_prior(x: np.ndarray, z: int, blocks: dict[int, np.ndarray]) -> float:
-    """Log prior density of x, nuisances' (2 pi)^(-K/2) left out as it cancels."""
+    """Log prior density of x, up to the nuisances' (2 pi)^(-K/2), which cancels."""
     out = -0.5 * float(x[:z] @ x[:z])
     for mine in blocks.values():
         k = mine.size
@@ -456,16 +501,19 @@ def _log_prior(x: np.ndarray, z: int, blocks: dict[int, np.ndarray]) -> float:
     return float(out)
 
 
-def deviations(c: Candidate, x: np.ndarray) -> np.ndarray:
-    """Parameters from deviations over scale."""
-    return c.neutral + c.scale * x
-
-
 def squares_left(
     f: Forms, effects: tuple[int, ...], weight: np.ndarray, x: np.ndarray | None = None
 ) -> np.ndarray:
-    """Squares (G,) that a set leaves at x, or at best, groups weighted, its variances taken off; and as one
-    more entry those of the nuisances themselves, for what was measured of them is data as well."""
+    """Sums of squares (G + 1,) that a set leaves, in excess of its own variances.
+
+    The last entry is the square of the nuisances: what was measured of them is data as well.
+
+    Args:
+        f: Quadratic forms of the gap.
+        effects: The set.
+        weight: Weight (G,) of each group.
+        x: Coordinates; the best ones for these weights if None.
+    """
     taken, z = quadratic_forms(f, effects), f.spectrum.num_nuisances
     weight = weight * np.exp(-taken.shift)
     if x is None:
@@ -475,5 +523,5 @@ def squares_left(
         matrix, pull = taken.weighed(weight)
         x, _ = least(matrix + np.diag(prior), pull, taken.low, taken.high)
     squares = weight * taken.energy(x)
-    more = f.count * f.freed[list(effects)].sum(0)  # of the squares, so much is what they free
+    more = f.count * f.freed[list(effects)].sum(0)  # the squares that they free
     return np.append(np.maximum(squares - more, np.minimum(squares, f.count)), x[:z] @ x[:z])

@@ -1,32 +1,45 @@
-"""The input of an attribution: whitened residuals, nuisances, and candidate effects about their best fits.
+"""The input of an attribution: whitened residuals, nuisances and linearised candidate effects.
 
     residual = nuisance @ z + sum over acting effects shift_j(theta_j) + background + noise
 
-Every row is divided by its noise's standard deviation. An effect is affine about `at`, where it was
-linearised: shift_j(theta) = shift + jacobian @ (theta - at).
+Every row is divided by the standard deviation of its noise. An effect is affine about `at`, the point at
+which it was linearised: shift_j(theta) = shift + jacobian @ (theta - at).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.fft import dct
 
-MODELLED = 0.1  # prior: share by which the form of a modelled effect is off from part to part
-BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the bands that are distinguished
+MODELLED = 0.1  # prior: relative error of a modelled effect's form, from part to part
+BANDS = (0.0, 1.0, 5.0)  # chosen: Hz; lower edges of the frequency bands
+
+
+def _some_rows(data: Any, chosen: np.ndarray, *names: str) -> dict[str, Any]:
+    """Some rows (a mask or indices) of the named fields; those that are None are left out."""
+    values = ((name, getattr(data, name)) for name in names)
+    return {name: value[chosen] for name, value in values if value is not None}
 
 
 @dataclass(frozen=True)
 class Rows:
-    """What each of n residuals is: indices of its trial, channel and part, and its time [s].
+    """The trial, channel, part and time of each of n residuals.
 
-    A part is a subtask, or any stretch of a trial. Rows of one cell (a channel in a part of a trial) are in
-    the order of time. `bands` [Hz]: lower edges of the frequency bands that are distinguished. `sd` (n,): the
-    noise's in the cosine coefficients of the cells, one where it is not given; `shape` (n,): what of it white
-    noise of the sensors has by itself, their level and colour left out.
+    A part is a subtask, or any stretch of a trial. A cell is one channel in one part of one trial; its rows
+    are in order of time.
+
+    Attributes:
+        trial, channel, part: Indices (n,) into the names below.
+        time: Times (n,) [s].
+        trials, channels, parts: Names.
+        bands: Lower edges of the frequency bands [Hz].
+        sd: Standard deviation (n,) of the noise in each cosine coefficient of the cells; None for 1.
+        shape: Variance (n,) of the same coefficients for white sensor noise, whatever its level and colour.
     """
 
     trial: Int[np.ndarray, " n"]
@@ -41,32 +54,47 @@ class Rows:
     shape: np.ndarray | None = None
 
     def taken(self, chosen: np.ndarray) -> Rows:
-        """The rows of a mask (n,) or of indices; names stay."""
-        return Rows(self.trial[chosen], self.channel[chosen], self.part[chosen], self.time[chosen],
-                    self.trials, self.channels, self.parts, self.bands,
-                    None if self.sd is None else self.sd[chosen],
-                    None if self.shape is None else self.shape[chosen])  # fmt: skip
+        """The rows of a mask (n,) or of indices."""
+        return replace(self, **_some_rows(self, chosen, "trial", "channel", "part", "time", "sd", "shape"))
 
     @property
     def cell(self) -> Int[np.ndarray, " n"]:
-        """One number for each trial, channel and part."""
+        """The number (n,) of each row's cell."""
         return (self.trial * len(self.channels) + self.channel) * len(self.parts) + self.part
+
+    @property
+    def place(self) -> Int[np.ndarray, " n"]:
+        """The channel and part (n,) of each row, over all trials, numbered consecutively."""
+        return np.unique(self.channel * len(self.parts) + self.part, return_inverse=True)[1]
+
+    def by_cell(self) -> list[np.ndarray]:
+        """Indices of the rows of each cell, in order of time."""
+        order = np.argsort(self.cell, kind="stable")
+        return np.split(order, np.flatnonzero(np.diff(self.cell[order])) + 1)
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect with k `parameters`; it changes nothing at `neutral`, and was linearised at `at`.
+    """One effect with k parameters; it changes nothing at `neutral`.
 
-    `scale`: the usual size of each deviation from neutral. The prior of all k together is a multivariate
-    Cauchy distribution of that scale, so that gross faults stay possible (Gelman et al., Ann. Appl. Stat. 2,
-    2008). `shift` (n,): by how much the effect at `at` shifts the residual, `jacobian` (n, k) its derivatives
-    there. `variance` (n,) is what it adds to each row's variance instead, at `at`; `evidence` [nats] what
-    else speaks for it. `form`: by
-    which share the effect's own form is usually off from one part of a recording to another. `hidden`:
-    parameters that may be others in every part, as phases of an oscillation are. `size` (k,): what a share of
-    a parameter is a share of; its deviation from neutral where that is not given, or not finite.
-    `frees` (n,): by how much, at most, the variance of cosine coefficients of cells may be larger
-    where it acts, in units of the noise's.
+    The joint prior of the k deviations from neutral is a multivariate Cauchy distribution of the given
+    `scale`, so that gross faults stay possible (Gelman et al., Ann. Appl. Stat. 2, 2008).
+
+    Attributes:
+        name: The effect; one effect may have several candidates.
+        parameters: Names of the parameters.
+        at: Parameters (k,) at which the effect was linearised.
+        neutral: Parameters (k,) at which it changes nothing.
+        scale: Usual size (k,) of their deviations from neutral.
+        shift: What the effect adds to each residual (n,) at `at`.
+        jacobian: Derivatives (n, k) of the shift there.
+        low, high: Bounds (k,) of the parameters.
+        variance: Variance (n,) that a random effect adds to each row, in place of a shift.
+        evidence: Log evidence from other sources [nats].
+        form: Usual relative error of the effect's form, from part to part of a recording.
+        hidden: Parameters that differ from part to part, such as the phase of an oscillation.
+        size: What relative errors (k,) of parameters refer to; their deviation from neutral if None or NaN.
+        frees: Most additional variance (n,) of each cosine coefficient, in units of the noise's, if it acts.
     """
 
     name: str
@@ -86,23 +114,25 @@ class Candidate:
     frees: np.ndarray | None = None
 
     def taken(self, rows: np.ndarray) -> Candidate:
-        """The candidate on some rows."""
-        variance = None if self.variance is None else self.variance[rows]
-        return Candidate(self.name, self.parameters, self.at, self.neutral, self.scale, self.shift[rows],
-                         self.jacobian[rows], self.low, self.high, variance, self.evidence,
-                         self.form, self.hidden, self.size,
-                         None if self.frees is None else self.frees[rows])  # fmt: skip
+        """The candidate on some rows (a mask or indices)."""
+        return replace(self, **_some_rows(self, rows, "shift", "jacobian", "variance", "frees"))
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Residuals (n,) at the nominal, derivatives by nuisances whose prior is N(0, 1), and candidates.
+    """Residuals at the nominal values, their derivatives by nuisances, and the candidates.
 
-    `expected`: how many of all candidates act, beforehand. `own`: nuisances of one trial each, of which other
-    trials say nothing. `carried` (D, n, M): draws of what noise makes of `raw_columns`, which are computed
-    from the same recording as the residual. `tolerance` (n,): smallest shift of each row that matters, in sds
-    of its noise; where it is `usual`, nobody's own, a cause that is found matters all the same. `told` (n,):
-    the mean square of a row if nothing acts, 1 where it is not given: repeats of one motion share an error.
+    Attributes:
+        rows: What each residual is.
+        residual: Whitened residuals (n,).
+        nuisance: Derivatives (n, z) by nuisances, whose prior is N(0, 1).
+        candidates: The effects that may act.
+        expected: Prior mean number of effects that act.
+        carried: Draws (D, n, M) of the error that sensor noise causes in `raw_columns`.
+        tolerance: Smallest shift (n,) of each row that matters, in standard deviations of its noise.
+        usual: Whether the tolerance is a default; a cause that is found then matters in any case.
+        mean_square: Mean square (n,) of each row if nothing acts, less for repeats that share an error;
+            None for 1.
     """
 
     rows: Rows
@@ -110,22 +140,20 @@ class Gap:
     nuisance: Float[np.ndarray, "n z"]
     candidates: tuple[Candidate, ...]
     expected: float = 1.0
-    own: tuple[int, ...] = ()
     carried: Float[np.ndarray, "d n m"] | None = None
     tolerance: Float[np.ndarray, " n"] | None = None
     usual: bool = False
-    told: Float[np.ndarray, " n"] | None = None
+    mean_square: Float[np.ndarray, " n"] | None = None
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
-        return Gap(self.rows.taken(rows), self.residual[rows], self.nuisance[rows],
-                   tuple(c.taken(rows) for c in self.candidates), self.expected, self.own,
-                   None if self.carried is None else self.carried[:, rows],
-                   None if self.tolerance is None else self.tolerance[rows], self.usual,
-                   None if self.told is None else self.told[rows])  # fmt: skip
+        candidates = tuple(c.taken(rows) for c in self.candidates)
+        carried = None if self.carried is None else self.carried[:, rows]
+        few = _some_rows(self, rows, "residual", "nuisance", "tolerance", "mean_square")
+        return replace(self, rows=self.rows.taken(rows), candidates=candidates, carried=carried, **few)
 
     def only(self, effects: Sequence[int]) -> Gap:
-        """The gap with some of its candidates alone, in this order."""
+        """The gap with some of its candidates only, in this order."""
         carried = self.carried
         if carried is not None:
             own = self.own_columns
@@ -135,7 +163,7 @@ class Gap:
 
     @property
     def raw_columns(self) -> Float[np.ndarray, "n m"]:
-        """Residual, nuisances, and each candidate's shift and derivatives by deviations over scale."""
+        """Residual, nuisances, and each candidate's shift and its derivatives by scaled deviations."""
         parts = [self.residual[:, None], self.nuisance]
         for c in self.candidates:
             parts += [c.shift[:, None], c.jacobian * c.scale]
@@ -143,7 +171,7 @@ class Gap:
 
     @property
     def own_columns(self) -> tuple[np.ndarray, ...]:
-        """Places of each candidate's columns, that of its shift first."""
+        """Indices of each candidate's columns, its shift first."""
         out, at = [], 1 + self.nuisance.shape[1]
         for c in self.candidates:
             out.append(np.arange(at, at + 1 + c.at.size))
@@ -152,7 +180,7 @@ class Gap:
 
     @property
     def to_constant(self) -> Float[np.ndarray, "m m"]:
-        """Turns raw columns, from their right, into those with each shift as it is at no deviation."""
+        """The matrix that, from the right, replaces each shift in the raw columns by its value at neutral."""
         own = self.own_columns
         out = np.eye(1 + self.nuisance.shape[1] + sum(mine.size for mine in own))
         for c, mine in zip(self.candidates, own, strict=True):
@@ -162,11 +190,15 @@ class Gap:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Columns (n, M) of a gap as cosines of each cell: residual, nuisances, and of every candidate its
-    constant part and its derivatives by deviations over `scale`.
+    """The columns of a gap after a cosine transform of each cell.
 
-    `group` (n,): channel, part and band of each coefficient, numbered without holes, trials together;
-    `own` the columns of candidate j, the first its constant part.
+    Attributes:
+        columns: Residual, nuisances, and each candidate's constant part and derivatives by scaled deviations
+            (n, M).
+        group: Group (n,) of each coefficient: channel, part and band over all trials, numbered consecutively.
+        band: Band (n,) of each coefficient.
+        own: Columns of each candidate, its constant part first.
+        num_nuisances: Number of nuisances.
     """
 
     columns: np.ndarray
@@ -177,7 +209,7 @@ class Spectrum:
 
 
 def spectrum(gap: Gap) -> Spectrum:
-    """The gap's columns under an orthonormal cosine transform of every cell (white noise stays white)."""
+    """Apply an orthonormal cosine transform to every cell of a gap (white noise stays white)."""
     columns, (band,) = cosines(gap.rows, gap.raw_columns @ gap.to_constant)
     key = (gap.rows.channel * len(gap.rows.parts) + gap.rows.part) * len(gap.rows.bands) + band
     group = np.unique(key, return_inverse=True)[1]
@@ -187,13 +219,19 @@ def spectrum(gap: Gap) -> Spectrum:
 def cosines(
     rows: Rows, columns: np.ndarray, variance: np.ndarray | None = None
 ) -> tuple[np.ndarray, tuple[np.ndarray]]:
-    """Columns (n, M) under an orthonormal cosine transform of every cell, over the noise's sd there (the root
-    of `variance` (n,) instead, where that is given), and the coefficients' bands."""
+    """Apply an orthonormal cosine transform to every cell.
+
+    Args:
+        rows: What each row is.
+        columns: Columns (n, M) to be transformed.
+        variance: Variance (n,) of the noise in each coefficient; the rows' own if None.
+
+    Returns:
+        Coefficients (n, M) over the noise's standard deviation, and a tuple of their bands (n,).
+    """
     out, band = np.empty_like(columns, float), np.zeros(len(columns), int)
-    order = np.argsort(rows.cell, kind="stable")
-    starts = np.flatnonzero(np.diff(rows.cell[order], prepend=-1))
     edges = np.asarray(rows.bands[1:])
-    for mine in np.split(order, starts[1:]):
+    for mine in rows.by_cell():
         out[mine] = dct(columns[mine], axis=0, norm="ortho")
         if mine.size > 1:
             step = float(np.median(np.diff(rows.time[mine])))

@@ -1,4 +1,4 @@
-"""Which sets of effects to ask about: adding, removing and exchanging effects while that leads on.
+"""The search for sets of effects: effects are added, removed and exchanged while that leads on.
 
 Sets within a window of the best are kept (Occam's window: Madigan & Raftery, JASA 89, 1994).
 """
@@ -21,27 +21,34 @@ from simgap.attribution.posterior import (
     screened,
 )
 
-# numerics: how many of a set's neighbours lead after one step, steps that these take, how many are fitted
+# numerics: neighbours of a set refined after screening, steps of this refinement, and neighbours then fitted
 SHORT, SCREEN, REFINED = 16, 3, 5
-WINDOW = 12.0  # numerics: nats behind the best set within which a set is kept
+WINDOW = 12.0  # numerics: nats below the best set within which a set is kept
 BEAM = 5  # numerics: sets of each size that are extended
-MOST = 6  # numerics: effects of a set at most
+MOST = 6  # numerics: most effects in a set
 
 
 def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> list[Model]:
-    """All sets found within the window of the best, best first; the empty set is always one. Of a set whose
-    effects were linearised at several places the best counts.
+    """Find the sets of effects within a window of the best.
 
-    Neighbours of a set are screened from its mode in one step, leading ones in a few; what leads then is
-    fitted to the end.
-    `beam`: how many sets of the window are extended. `among`: of these candidates alone.
+    The neighbours of a set are screened from its mode in one step, the leading ones refined in a few, and
+    what leads then is fitted until it converges. Of a set whose effects were linearised at several points the
+    best counts.
+
+    Args:
+        f: Quadratic forms of the gap.
+        beam: Number of sets in the window that are extended.
+        among: Candidates to choose from; None for all.
+
+    Returns:
+        The sets, best first; the empty set is always one of them.
     """
     among = list(range(len(f.gap.candidates)) if among is None else among)
     seen: dict[tuple[int, ...], Model] = {(): fitted(f, ()), **{(j,): fitted(f, (j,)) for j in among}}
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}
-    # What leaves the least squares may be the larger of two causes, though others score higher while the
-    # smaller one is there: a background that is off everywhere costs little.
+    # The effect that leaves the least squares may be the larger of two causes although others score higher as
+    # long as the smaller one is unexplained: a background that is off everywhere costs little.
     alone = min((seen[(j,)] for j in among), key=lambda m: float(m.energy.sum()), default=seen[()])
     while True:
         best = max(m.score for m in seen.values())
@@ -68,7 +75,7 @@ def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> li
 
 
 def _neighbours(f: Forms, effects: tuple[int, ...], among: list[int]) -> list[tuple[int, ...]]:
-    """Sets with one effect more, one left out, or one exchanged; of one name's forms only one acts."""
+    """Sets with one effect added, removed or exchanged; only one form of an effect acts."""
     names = [c.name for c in f.gap.candidates]
     fewer = [tuple(j for j in effects if j != out) for out in effects]
     more = [
@@ -81,27 +88,32 @@ def _neighbours(f: Forms, effects: tuple[int, ...], among: list[int]) -> list[tu
 
 
 def weights(models: list[Model]) -> np.ndarray:
-    """Posterior probabilities of the sets, which sum to 1."""
+    """Posterior probabilities of the sets; they sum to 1."""
     score = np.array([m.score for m in models])
     return np.exp(score - np.logaddexp.reduce(score))
 
 
-# Whether there is a gap at all: a Bayes factor, whose inverse bounds the chance of a healthy recording.
+# Whether there is a gap at all: a Bayes factor, whose inverse bounds the p-value.
 #
-# Under the healthy model a Bayes factor against it exceeds b with a probability of 1 / b at most (an e-value:
-# Vovk & Wang, Ann. Stat. 49, 2021). A simulator is never quite the healthy model; healthy twins, taken
-# through the same statistic, say how far it is off (conformal rank: Besag & Clifford, Biometrika 78, 1991).
+# Under the healthy model a Bayes factor against it exceeds b with a probability of at most 1 / b (an e-value:
+# Vovk & Wang, Ann. Stat. 49, 2021). No simulator is exactly the healthy model: the statistics of healthy
+# twins tell by how much the bound is off (conformal rank: Besag & Clifford, Biometrika 78, 1991).
 
-# prior: shares of groups off, besides the usual one: a gap may be in one place alone
+# prior: further shares of groups in which the model is off: a gap may be confined to one place
 RARE = (0.002, 0.01, 0.03)
 ENOUGH = 4  # cited: twins as extreme after which a p-value is clear (Besag & Clifford's h)
-SURE = 1e-6  # chosen: so small a chance is clear, were the next twin twice as far as those before
+SURE = 1e-6  # chosen: p-value that is clear even if the next twin were twice as extreme as those before
 
 
 @dataclass(frozen=True)
 class Detection:
-    """`statistic`: log Bayes factor [nats] of a gap; `p_value`; `resolution`: the smallest p that could have
-    been seen, 0 where no twins were taken."""
+    """The test for a gap.
+
+    Attributes:
+        statistic: Log Bayes factor of a gap [nats].
+        p_value: Probability that a healthy recording shows so large a statistic.
+        resolution: Smallest p-value that the twins could have given; 0 without twins.
+    """
 
     statistic: float
     p_value: float
@@ -109,13 +121,16 @@ class Detection:
 
     @property
     def unseen(self) -> float:
-        """Probability of a gap where it raises no alarm: by its Bayes factor, with even odds beforehand."""
+        """Probability of a gap that raises no alarm, from its Bayes factor at even prior odds."""
         return float(expit(min(self.statistic, 0.0)))
 
 
 def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ...] = ()) -> float:
-    """Log Bayes factor of a gap beyond the effects that are `acting`, by others or the background, against
-    these effects and stated noise alone."""
+    """Log Bayes factor [nats] of a gap beyond the effects in `acting`.
+
+    Further effects or the background explain it; the alternative is these effects with the stated noise
+    alone.
+    """
     models = sought(f) if models is None else models
     wider = [m for m in models if {*acting} <= {*m.effects}]
     wider += [] if any(m.effects == acting for m in wider) else [fitted(f, acting)]
@@ -130,7 +145,7 @@ def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ..
 
 
 def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
-    """The same with what is below the tolerance as likely as not: whether there is a gap that matters."""
+    """Score the sets with a background in which gaps below the tolerance are as likely as not."""
     other = replace(f, lenient=True)
 
     def score(m: Model) -> float:
@@ -141,22 +156,26 @@ def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
 
 
 def clear(value: float, most: float) -> bool:
-    """Whether a statistic is that of a gap for certain, were a healthy one twice the `most` that was seen."""
+    """Whether a statistic is surely a gap, even if a healthy one reached twice the largest seen (`most`)."""
     return max(0.0, most) < doubtful(value)
 
 
 def doubtful(value: float) -> float:
-    """The least statistic [nats] of a healthy recording that leaves a gap's `value` in doubt."""
+    """Smallest statistic [nats] of a healthy recording that leaves a gap's `value` in doubt."""
     return (value + float(np.log(SURE))) / 2
 
 
 def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
-    """The chance of a healthy recording to show so large a statistic.
+    """Test for a gap, by theory or against healthy twins.
 
-    By Markov's inequality healthy recordings exceed s with a probability of exp(-s) at most, times the
-    expectation of their Bayes factor: one by theory, estimated on twins. What twins exceed is as likely as
-    their ranks say; the larger of both counts. Twins are taken one by one until the answer is clear:
-    ENOUGH exceed the recording's, or another one twice as far as they are would leave no doubt.
+    By Markov's inequality a healthy recording exceeds s with a probability of at most exp(-s) times the
+    expectation of its Bayes factor: one in theory, estimated from twins. The rank among the twins gives a
+    second p-value; the larger of the two counts.
+
+    Args:
+        value: The statistic of the recording [nats].
+        twins: Statistics of healthy twins. They are drawn one by one until the answer is clear: ENOUGH exceed
+            the recording's, or a next one twice as extreme would leave no doubt.
     """
     p = float(np.exp(min(0.0, -value)))
     if twins is None:

@@ -1,14 +1,14 @@
-"""The verdict, read off a posterior over sets of effects: none, named, a set, or unknown.
+"""The verdict from a posterior over sets of effects: none, named, a set, or unknown.
 
-One reading for every diagnosis (of blocks, of given trials, of robots): they differ in what their sets are
-fitted to, and in what each set is said to leave.
+All diagnoses (of blocks, of given trials, of robots) share these rules; they differ in the data their sets
+are fitted to.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import expit
@@ -18,24 +18,28 @@ from simgap.attribution.posterior import Forms, Model, squares_left
 from simgap.attribution.problem import Rows
 from simgap.attribution.search import Detection
 
-ALARM = 0.01  # chosen: chance of a healthy recording to be called otherwise
+ALARM = 0.01  # chosen: probability that a healthy recording raises an alarm
 # learned: share of named sets that were right over their mean probability (`experiments.gap_drawn`, 53 named
 # of seeds 271171 and 271211): what the catalogue lacks passes for what it has, with no sign of it
 RECORD = 0.71
-MOST = 0.5  # cited: share of the gap left from which on it is unknown (the interface's definition)
-WIDTH = 0.25  # chosen: of that share's logarithm, logistic
-# chosen: share of the gap that is nothing next to the rest: an error of a tenth in a form leaves half of that
+MOST = 0.5  # cited: share of the gap left above which it is unknown (the interface's definition)
+WIDTH = 0.25  # chosen: scale of the logistic function of that share's logarithm
+# chosen: negligible share of the gap; an error of a tenth in a form leaves half of it
 LEAST = 0.02
-RULED_OUT = 20.0  # chosen: odds against a set from which on it is no alternative
-LISTED = 1e-4  # look: probability below which a set is one of the others
-
-V = TypeVar("V", bound="Verdict")
+RULED_OUT = 20.0  # chosen: odds against a set at which it is no alternative
+LISTED = 1e-4  # look: sets below this probability are summed up as others
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """One set of `effects`, by name: `weight`, its posterior probability; `causes`, those of them that
-    matter; `known`, the probability that these are the cause, should the set be right."""
+    """A set of effects as an explanation of the gap.
+
+    Attributes:
+        effects: Names of all its effects.
+        weight: Posterior probability of the set.
+        causes: Those effects that matter.
+        known: Probability that they are the cause if the set is right.
+    """
 
     effects: tuple[str, ...]
     weight: float
@@ -45,18 +49,19 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Verdict:
-    """`verdict`: none, named, set or unknown; its `causes`, and effects `indistinguishable` from them;
-    `probabilities` of none, unknown and every set of causes, which sum to one."""
+    """The verdict on a gap.
+
+    Attributes:
+        verdict: none, named, set or unknown.
+        causes: The named effects.
+        indistinguishable: Effects that may act in place of a cause.
+        probabilities: Of none, unknown and every set of causes; they sum to one.
+    """
 
     verdict: str
     causes: tuple[str, ...]
     indistinguishable: tuple[str, ...]
     probabilities: dict[str, float]
-
-    def beside(self: V, more: Iterable[str]) -> V:
-        """The verdict with more effects that cannot be distinguished from its causes."""
-        partners = tuple(sorted({*self.indistinguishable, *more} - {*self.causes}))
-        return replace(self, verdict="set", indistinguishable=partners) if partners else self
 
 
 def conclude(
@@ -91,14 +96,15 @@ def conclude(
     causes = leading(sets) if chosen is None else chosen
     if within["unknown"] > 0.5 or not causes:
         return Verdict("unknown", (), (), probability)
-    return Verdict("named", causes, (), probability).beside(alike(sets, causes))
+    partners = alike(sets, causes)
+    return Verdict("set" if partners else "named", causes, partners, probability)
 
 
 def calibrated(within: Mapping[str, float], unseen: float, record: float) -> dict[str, float]:
-    """Probabilities as often right as they say, from those within the catalogue.
+    """Calibrate probabilities that assume the catalogue to be complete.
 
-    A set that explains a gap is right as often as the method's record says, and a recording without an alarm
-    may hide a gap with a probability of `unseen`; both leave their rest to `unknown`.
+    An explanation is right as often as the method's record says, and a recording without an alarm hides a gap
+    with probability `unseen`; the rest is `unknown`.
     """
     out = {name: p * (1 - unseen if name == "none" else record) for name, p in within.items()}
     out["unknown"] = 0.0
@@ -107,13 +113,15 @@ def calibrated(within: Mapping[str, float], unseen: float, record: float) -> dic
 
 
 def healthy(p_value: float) -> float:
-    """Probability that there is no gap: as likely as one where the alarm is raised."""
+    """Probability that there is no gap; one half at the p-value that raises the alarm."""
     return float(expit(np.log(max(p_value, 1e-300) / ALARM)))
 
 
 def probabilities(sets: Sequence[Explanation], p_value: float) -> dict[str, float]:
-    """Of none, unknown and every set of causes, joined by +; they sum to one. What a set is not known to
-    explain, and what the empty set has, is unknown."""
+    """Probabilities of none, unknown, and every set of causes (names joined by +); they sum to one.
+
+    Sets whose causes are not the cause, and the empty set, count as unknown.
+    """
     none = healthy(p_value)
     out = {"none": none, "unknown": 0.0}
     for one in sets:
@@ -129,34 +137,40 @@ def probabilities(sets: Sequence[Explanation], p_value: float) -> dict[str, floa
 
 
 def log_odds(chances: Iterable[float]) -> float:
-    """Log posterior odds [nats] of several effects to act, by the least of their probabilities."""
+    """Posterior log odds [nats] that several effects act, from the least of their probabilities."""
     chance = float(np.clip(min(chances, default=0.0), 1e-12, 1 - 1e-12))
     return float(np.log(chance / (1 - chance)))
 
 
 def acting(sets: Sequence[Explanation], p_value: float) -> dict[str, float]:
-    """Probability of every effect of some set to act."""
+    """Probability that each effect acts."""
     gap, out = 1 - healthy(p_value), dict[str, float]()
     for one in sets:
         for name in one.effects:
             out[name] = out.get(name, 0.0) + one.weight * gap
-    return {name: min(value, 1.0) for name, value in out.items()}  # a sum of many is rounded
+    return {name: min(value, 1.0) for name, value in out.items()}  # rounding of the sum
 
 
 def known(left: float, explained: float, p_rest: float = 0.0) -> float:
-    """Probability that a set's effects are the cause: they leave little.
+    """Probability that a set's effects are the cause: they leave little of the gap.
 
-    `left`: share of the gap that the set leaves where it acts, `explained`: what it explains of all of it in
-    trials that took no part. Logistic in the logarithm of the larger share that is left, as far as anything
-    is: `p_rest` is the chance of noise to look like what is left, for of a small gap no share is certain.
+    Logistic in the logarithm of the larger share left, as far as anything is left at all: of a small gap no
+    share is certain.
+
+    Args:
+        left: Share of the gap that the set leaves where it acts.
+        explained: Share of the whole gap that it explains, on held-out trials.
+        p_rest: Probability that what is left is noise.
     """
     most = expit(np.log(MOST / max(left, 1 - explained, 1e-6)) / WIDTH)
     return float(1 - (1 - healthy(p_rest)) * (1 - most))
 
 
 def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:
-    """The causes that are likeliest by all sets that have just these; fewer of them where doing without the
-    others is not ruled out."""
+    """The likeliest causes, summed over all sets that have just these.
+
+    A subset of them is preferred if it is not ruled out.
+    """
     chance: dict[tuple[str, ...], float] = {}
     for one in sets:
         if one.causes:
@@ -167,30 +181,35 @@ def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:
 
 
 def alike(sets: Sequence[Explanation], causes: tuple[str, ...]) -> tuple[str, ...]:
-    """Effects that take a cause's place in sets no larger that are not ruled out.
+    """Effects that replace a cause in sets that are no larger and not ruled out.
 
-    Effects of the likeliest set that are too small to be causes are no causes in others either.
+    Effects of the likeliest set that are too small to be causes are no causes in other sets either.
     """
     holding = [one for one in sets if {*causes} <= {*one.effects}]
     best = max(holding, key=lambda one: one.weight)
-    beside, found = {*best.effects} - {*causes}, set[str]()
+    small, partners = {*best.effects} - {*causes}, set[str]()
     for one in sets:
-        mine = {*one.effects} - beside
-        if one.weight * RULED_OUT > best.weight and len(mine) <= len(causes):
-            found |= mine - {*causes}
-    return tuple(sorted(found))
+        large = {*one.effects} - small
+        if one.weight * RULED_OUT > best.weight and len(large) <= len(causes):
+            partners |= large - {*causes}
+    return tuple(sorted(partners))
 
 
-# What share of the gap each effect of a set explains, and what is left: squares, the noise's taken off.
+# What share of the gap each effect of a set explains, and what is left: squares in excess of the noise.
 
-DRAWS = 200  # numerics: of the posterior, for intervals
+DRAWS = 200  # numerics: draws of the posterior, for intervals
 
 
 @dataclass(frozen=True)
 class Shares:
-    """`before`: squares of the residual with nuisances alone fitted, `after`: with the set, `floor`: the
-    noise's own. `each`: draws (D, J of the set) of the share that each effect explains by itself. `inside`:
-    share that is left where the set itself shifts anything."""
+    """Shares of the gap by effect.
+
+    Attributes:
+        before, after: Squares of the residual with nuisances alone, and with the set.
+        floor: Squares of the noise.
+        each: Draws (D, J) of the share that each of the set's effects explains.
+        inside: Share that is left where the set shifts anything.
+    """
 
     before: float
     after: float
@@ -203,8 +222,10 @@ class Shares:
         cls, before: float, after: float, floor: float, lost: np.ndarray, rng: np.random.Generator,
         inside: float = 1.0,
     ) -> Shares:  # fmt: skip
-        """Each effect has what is `lost` (J,) by leaving it out, in proportion: they and the remainder sum to
-        one. Noise around what is left, and around what there was, makes the interval."""
+        """Divide the explained share in proportion to the squares `lost` (J,) by leaving each effect out.
+
+        Shares and remainder sum to one. The noise of the squares gives the intervals.
+        """
         part = lost / max(float(lost.sum()), 1e-12)
         scatter = np.sqrt(2 * floor + 4 * max(after - floor, 0.0))
         drawn = after + scatter * rng.standard_normal(DRAWS)
@@ -217,13 +238,13 @@ class Shares:
         return float(np.clip((self.after - self.floor) / max(self.before - self.floor, 1e-9), 0.0, 1.0))
 
     def of_effect(self, k: int) -> tuple[float, tuple[float, float]]:
-        """The share of the k-th effect, and its 90 % interval."""
+        """Share of the k-th effect, and its 90 % interval."""
         low, high = np.percentile(self.each[:, k], (5, 95))
         return float(self.each[:, k].mean()), (float(low), float(high))
 
 
 def shares(f: Forms, model: Model, noise: np.ndarray, rng: np.random.Generator) -> Shares:
-    """Shares of a set's effects; `noise` (G,): variance of each group's noise."""
+    """Compute the shares of a set's effects; `noise` (G,) is the variance of each group's noise."""
     weight, count = 1 / noise, np.append(f.count, f.spectrum.num_nuisances)
     floor, by_group = float(count.sum()), squares_left(f, (), weight)
     before = float(by_group.sum())
@@ -243,14 +264,14 @@ def shares(f: Forms, model: Model, noise: np.ndarray, rng: np.random.Generator) 
     return Shares.of(before, after, floor, lost, rng, inside)
 
 
-# Where the gap lies: excess of squares by trial, channel, part and band, false discoveries controlled.
+# Where the gap lies: excess squares by trial, channel, part and band, with control of false discoveries.
 
-RATE = 0.05  # chosen: share of false discoveries among the cells that are listed
+RATE = 0.05  # chosen: share of false discoveries among the listed cells
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell that shows a gap: its `share` of the excess square, and its excess as a normal score `z`."""
+    """A cell that shows a gap: its `share` of the excess squares, and the excess as a normal score `z`."""
 
     trial: str
     channel: str
@@ -263,9 +284,16 @@ class Cell:
 def tallied(
     rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers (c,), squares in units of the noise (c,) and counts (c,) of the cells with each a band.
+    """Sum the squares of each cell and band.
 
-    `left` (n,): cosine coefficients of a residual; `noise` (n,): their standard deviation.
+    Args:
+        rows: What each row is.
+        band: Band (n,) of each coefficient.
+        left: Cosine coefficients (n,) of a residual.
+        noise: Their standard deviation (n,).
+
+    Returns:
+        Numbers of the cells (c,), squares in units of the noise (c,), and counts (c,).
     """
     key, inverse = np.unique(rows.cell * len(rows.bands) + band, return_inverse=True)
     square = (left / noise) ** 2
@@ -273,14 +301,13 @@ def tallied(
 
 
 def _step(rows: Rows) -> float:
-    """Usual time [s] from row to row of a cell; infinite where no cell has two."""
-    order = np.argsort(rows.cell, kind="stable")
-    step = np.diff(rows.time[order])[np.diff(rows.cell[order]) == 0]
-    return float(np.median(step)) if step.size else np.inf
+    """Median time step [s] between rows of a cell; infinite if no cell has two."""
+    steps = np.concatenate([np.diff(rows.time[mine]) for mine in rows.by_cell()])
+    return float(np.median(steps)) if steps.size else np.inf
 
 
 def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray) -> tuple[Cell, ...]:
-    """Cells whose squares exceed the noise's, largest share first (Benjamini & Hochberg, JRSS B 57, 1995)."""
+    """Cells whose squares exceed the noise, largest share first (Benjamini & Hochberg, JRSS B 57, 1995)."""
     key, energy, count = tallied(rows, band, left, noise)
     chance = chi2.sf(energy, count)
     listed = np.flatnonzero(false_discovery_control(np.clip(chance, 0, 1), method="bh") < RATE)
@@ -292,14 +319,14 @@ def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarra
         cell, b = divmod(int(key[at]), len(rows.bands))
         cell, part = divmod(cell, len(rows.parts))
         trial, channel = divmod(cell, len(rows.channels))
-        # log sf keeps what is far beyond the smallest number
+        # beyond the smallest representable probability
         z = float(norm.isf(chance[at])) if chance[at] > 1e-300 else float(np.sqrt(2 * excess[at] / 2 + 37**2))
         out.append(Cell(rows.trials[trial], rows.channels[channel], rows.parts[part],
                         (edges[b], edges[b + 1]), float(excess[at]) / total, z))  # fmt: skip
     return tuple(sorted(out, key=lambda c: -c.share))
 
 
-# What every diagnosis says of a gap, as entries of the JSON document.
+# The entries of the JSON document that all diagnoses share.
 
 Entries = list[dict[str, Any]]
 
@@ -311,8 +338,15 @@ def entries(
     attribution: Mapping[str, tuple[float, float, tuple[float, float]]],
     where: Entries,
 ) -> dict[str, Any]:
-    """Verdict, detection, remainder (share, p-value, where), every effect's probability, share of the
-    gap and its 90 % interval, and where. A gap that is none, or does not matter, lies nowhere."""
+    """Assemble verdict, detection, remainder, attribution and cells of the document.
+
+    Args:
+        verdict: The verdict.
+        detection: The test for a gap.
+        remainder: Share, p-value and cells of what is unexplained.
+        attribution: Probability, share of the gap and its 90 % interval for each effect.
+        where: Cells of the gap; left out if there is none that matters.
+    """
     gap = verdict.verdict != "none"
     share, p_value, places = remainder
     return {
@@ -335,7 +369,7 @@ def entries(
 
 
 def rows(cells: Iterable[Cell]) -> Entries:
-    """Cells as the document lists them."""
+    """Cells as entries of the document."""
     return [
         {"trial": c.trial, "channel": c.channel, "subtask": c.part,
          "band": list(c.band), "share": c.share, "z": c.z}

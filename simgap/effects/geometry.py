@@ -255,9 +255,9 @@ def _scatter_hand_roll(given, residual: np.ndarray):
 
     from simgap.gap.assemble import on_grid, rows_of
 
-    rows, arrays, there = rows_of(given), given.frame.arrays, given.whitening.weight > 0
+    rows, arrays, there = rows_of(given), given.frame.arrays, given.there
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
-    lever = rolled_offset(width * arrays.phase[..., Phase.CARRY], 1.0)[..., None] * given.whitening.weight
+    lever = rolled_offset(width * arrays.phase[..., Phase.CARRY], 1.0)[..., None] * given.weight
     lever[..., [c for c, name in enumerate(CHANNELS) if name != "offset"]] = 0.0
     lever = lever[there]
     unit, square = np.zeros(lever.size), np.zeros(lever.size)

@@ -285,7 +285,7 @@ JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
 def _scatter_clock_jitter(given, residual: np.ndarray):
     from simgap.gap.assemble import on_grid, rows_of
 
-    rows, rate = rows_of(given), _clock_rates(given)[given.whitening.weight > 0]
+    rows, rate = rows_of(given), _clock_rates(given)[given.there]
     size = np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1)
     part = rows.trial * len(rows.parts) + rows.part
     return on_grid("clock_jitter", residual**2, size[rows.cell], JITTERS, part)
@@ -297,13 +297,13 @@ def _clock_rates(given) -> np.ndarray:
     _, velocity = tips(world)
     step = np.median(np.diff(world.t, axis=1))
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
-    out = np.zeros_like(given.whitening.weight)
+    out = np.zeros_like(given.weight)
     # Central differences of positions read at wrong times: v times the times' difference over 2 steps; and
     # the mean (1, 4, 1) / 6 of speeds read at them.
     rate = gradient(world.t, mean_v)
     for k, c in enumerate(("vx", "vy")):
         out[..., CHANNELS.index(c)] = np.hypot(mean_v[..., k] / step, rate[..., k]) / np.sqrt(2)
-    return out * given.whitening.weight
+    return out * given.weight
 
 
 CLOCK_JITTER = HandEffect(

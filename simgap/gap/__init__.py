@@ -1,1 +1,1 @@
-"""Where simulation and recording part, which unmodelled effect causes it, how far the gap shrinks."""
+"""Where simulation and recordings differ, which unmodelled effect causes it, how far the gap shrinks."""

@@ -1,4 +1,4 @@
-"""The gap of aligned trials as an attribution takes it: whitened rows, nuisances, linearised candidates."""
+"""The gap of aligned trials as input of an attribution: whitened rows, nuisances, linear candidates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from simgap.gap.problem import (
     Fitted,
     Problem,
     columns_of,
-    cost_at,
     evaluated,
     free_of,
     limits,
@@ -32,15 +31,23 @@ from simgap.gap.problem import (
 from simgap.gap.sensor_noise import MEDIAN
 from simgap.phases import Phase
 
-# What scatters residuals instead of shifting them: the variance that an effect adds, and how much of it.
+# Effects that scatter residuals instead of shifting them: the variance they add, and their size.
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """`variance` (n,) over the noise's that an effect of size `value` adds to each cosine coefficient of a
-    cell (in the order of `assemble.rows_of`), log sd of that value, and evidence [nats] `known` of another
-    kind. `same`: whether its size is the same everywhere. The variance of
-    coefficients that it `frees` may be larger by so much (n,), whatever it is."""
+    """A random effect.
+
+    Attributes:
+        effect: Its name.
+        value: Its size.
+        log_sd: Standard deviation of the log of its size.
+        variance: Variance (n,) over the noise's that it adds to each cosine coefficient, in the order of
+            `rows_of`.
+        known: Log evidence of another kind [nats].
+        same: Whether its size is the same everywhere.
+        frees: Most additional variance (n,) of each coefficient, whatever the size.
+    """
 
     effect: str
     value: float
@@ -55,10 +62,18 @@ def on_grid(
     effect: str, square: np.ndarray, unit: np.ndarray, grid: np.ndarray, part: np.ndarray | None = None,
     spread: float = 0.0,
 ) -> Scatter:  # fmt: skip
-    """The most likely size of a scatter with variance size^2 `unit` (n,), from squares (n,) of residuals.
+    """The most likely size of a random effect whose variance is size^2 `unit`.
 
-    `part` (n,): numbers of parts in which one cause has one size, but for a log sd of `spread`. One that
-    would have any other in each, by a Bayes factor of POSITIVE, or a size at the grid's end, is an imitation.
+    An imitation has a size at the end of the grid, or different sizes in the parts by a Bayes factor of
+    POSITIVE.
+
+    Args:
+        effect: Its name.
+        square: Squared residuals (n,).
+        unit: Variance (n,) at size 1.
+        grid: Sizes.
+        part: Part (n,) of each residual; a single cause has the same size in all parts.
+        spread: Standard deviation of the log size between parts.
     """
     mine = np.flatnonzero(unit > 0)
     variance = 1 + grid[:, None] ** 2 * unit[mine]
@@ -67,7 +82,7 @@ def on_grid(
     best, weight = int(score.argmax()), np.exp(score - score.max())
     centre = np.average(np.log(grid), weights=weight)
     sd = max(float(np.sqrt(np.average((np.log(grid) - centre) ** 2, weights=weight))), 1e-3)
-    known = float(np.log(np.mean(weight)))  # what the choice of its size costs: uniform over the grid
+    known = float(np.log(np.mean(weight)))  # cost of the unknown size: uniform over the grid
     same = best < grid.size - 1
     if part is not None:
         each = np.stack([np.bincount(part[mine], row) for row in nats])
@@ -82,7 +97,7 @@ def on_grid(
 
 
 def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Scatter]:
-    """What each of the named effects that scatter adds to residuals (n,); not those that say nothing."""
+    """The scatter of each of the named effects in residuals (n,), if there is any."""
     scattering: list[Callable] = [
         e.scatter for n, e in catalogue().items() if n in names and e.scatter is not None
     ]
@@ -90,39 +105,39 @@ def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Sca
     return [s for s in found if s is not None]
 
 
-# How loud a recording's noise is and how it is coloured, learned where nothing but noise is expected.
+# Level and colour of a recording's noise, estimated where nothing but noise is expected.
 #
-# A velocity's residual averages three samples of velocity and differences three of position, so its noise is
-# not white: at low frequency it holds (4 + 2 cos w)^2 / 36 of the velocity's density and sin(w)^2 of the
-# position's. Beyond that sensors of one kind may be louder than stated and remember their last error (AR(1)).
-# Level and colour of each kind are the likeliest for the median squares of some frequency bands: free motion
-# for forces, hands at rest for velocities, grips for positions. Medians do not see what an effect does in
-# places.
+# The residual of a velocity averages three samples of velocity and differences three of position, so its
+# noise is not white: at low frequency it has (4 + 2 cos w)^2 / 36 of the velocity's density and sin(w)^2 of
+# the position's. In addition, sensors of one kind may be louder than stated and remember their last error
+# (AR(1)). Level and colour of each kind maximise the likelihood of the median squares in some frequency
+# bands: in free motion for forces, at rest for velocities, in grips for positions. Medians ignore local
+# effects.
 
 KINDS = (("x", "y", "distance", "offset"), ("vx", "vy"), ("fx", "fy", "grip", "shear"))
-LEVELS = np.linspace(0.6, 1.5, 37)  # prior: noise over the stated one; beyond that it is an effect
+LEVELS = np.linspace(0.6, 1.5, 37)  # prior: noise over the stated one; more is an effect
 COLOURS = np.linspace(0.0, 0.4, 9)  # prior: correlation from sample to sample; more is an effect
-NOISE_BANDS = 6  # numerics: of which medians are taken
-SLOWEST = 1.0  # chosen: Hz; what is slower says more of effects than of noise
-OUTLIER = 8.0  # chosen: nats that a band costs at most: an effect may fill it
-FEWEST = 12  # numerics: coefficients of a band
-CLEAN = 1.25  # numerics: variance of residuals over that of noise alone, beyond which they say nothing of it
+NOISE_BANDS = 6  # numerics: bands whose medians are taken
+SLOWEST = 1.0  # chosen: Hz; slower motion shows effects rather than noise
+OUTLIER = 8.0  # chosen: nats; most that a band costs, as an effect may fill it
+FEWEST = 12  # numerics: fewest coefficients of a band
+# numerics: variance of residuals over that of noise alone, above which they do not show the noise
+CLEAN = 1.25
 
 
 def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
-    """The rows with the noise's standard deviation in each cosine coefficient of their cells, in units of the
-    stated noise, and with the shape of white noise there."""
+    """Set the noise's standard deviation and shape in each cosine coefficient of the rows' cells."""
     turn, frequency = _places(rows)
     shape = _shape(given, rows, turn)
     square = cosines(rows, residual[:, None])[0][:, 0] ** 2 / shape
     arrays = given.frame.arrays
-    there = given.whitening.weight > 0
+    there = given.there
     doubt = np.square(arrays.sd[there] / arrays.plain[there])
     sure = (np.bincount(rows.cell, doubt) < CLEAN * np.bincount(rows.cell))[rows.cell]
     phase = arrays.phase.argmax(-1)[..., None].repeat(len(CHANNELS), -1)[there]
     still = np.isin(phase, (Phase.PICKUP, Phase.PLACE))
     variance = shape.copy()
-    # Hands that move do more within a sample than differences show: speeds have another noise there.
+    # Moving hands do more within a sample than differences show: their velocities have another noise.
     for names, at, quiet in (
         (KINDS[0], True, True), (KINDS[1], still, True), (KINDS[1], ~still, True),
         (KINDS[2], True, phase == Phase.FREE),
@@ -135,10 +150,9 @@ def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
 
 
 def _places(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Of each coefficient (n,): radians from sample to sample, and frequency [Hz]."""
+    """Radians per sample and frequency [Hz] of each coefficient (n,)."""
     turn, frequency = np.zeros(rows.cell.size), np.zeros(rows.cell.size)
-    order = np.argsort(rows.cell, kind="stable")
-    for mine in np.split(order, np.flatnonzero(np.diff(rows.cell[order])) + 1):
+    for mine in rows.by_cell():
         turn[mine] = np.pi * np.arange(mine.size) / mine.size
         if mine.size > 1:
             frequency[mine] = turn[mine] / (2 * np.pi * np.median(np.diff(rows.time[mine])))
@@ -146,7 +160,7 @@ def _places(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _shape(given: Problem, rows: Rows, turn: np.ndarray) -> np.ndarray:
-    """Density (n,) of the residual's stated noise over white noise's of the same variance."""
+    """Density (n,) of the residuals' stated noise over that of white noise of the same variance."""
     arrays, t = given.frame.arrays, given.frame.world.t
     step = float(np.median(np.diff(t[0])))
     out = np.ones(turn.size)
@@ -165,7 +179,7 @@ def _density(turn: np.ndarray | float, colour: float | np.ndarray) -> np.ndarray
 
 
 def _likeliest(turn: np.ndarray, square: np.ndarray) -> tuple[float, float]:
-    """Level and colour of coefficients at `turn` with these squares."""
+    """Most likely level and colour of coefficients at `turn` [rad per sample] with these squares."""
     at = np.minimum((turn / np.pi * NOISE_BANDS).astype(int), NOISE_BANDS - 1)
     score = -0.5 * np.square(2 * np.log(LEVELS)[:, None] / STATED) + np.zeros(COLOURS.size)
     for band in range(NOISE_BANDS):
@@ -174,30 +188,30 @@ def _likeliest(turn: np.ndarray, square: np.ndarray) -> tuple[float, float]:
             continue
         seen = np.log(max(float(np.median(square[mine])) / MEDIAN, 1e-9))
         expected = 2 * np.log(LEVELS)[:, None] + np.log(_density(float(np.mean(turn[mine])), COLOURS))
-        # The median of n squares is off by 2.33 / sqrt(n) of itself.
+        # The relative error of the median of n squares is 2.33 / sqrt(n).
         score = score - np.minimum(0.5 * np.square(seen - expected) * mine.sum() / 2.33**2, OUTLIER)
     level, colour = np.unravel_index(int(score.argmax()), score.shape)
     return float(LEVELS[level]), float(COLOURS[colour])
 
 
-# What sensors' noise makes of fitted candidates: the same ones on recordings with a little more noise.
+# How sensor noise affects fitted candidates: they are evaluated on recordings with a little more noise.
 #
-# `simgap.attribution.posterior` takes it off the products of their columns.
+# `simgap.attribution.posterior` subtracts the effect from the products of their columns.
 
 Other = TypeVar("Other")
 
-# numerics: signs of draws by places; products of what has different places cancel over the draws
+# numerics: signs of draws by place; products of noise at different places cancel over the draws
 SIGNS = np.array([[1, 1], [1, -1]], float)
-SIZES = (1.0, -0.25)  # numerics: sds of noise of a draw; both show whether it acts in proportion
-ALIKE = 0.5  # numerics: by which share of the larger both may differ
+SIZES = (1.0, -0.25)  # numerics: sds of noise in a draw; two sizes show whether its effect is proportional
+ALIKE = 0.5  # numerics: largest difference of the two, as a share of the larger
 
 
 def redrawn(given: Problem) -> tuple[Problem, ...]:
-    """The problem with more noise on what was recorded: of every draw one of each of SIZES.
+    """The problem with additional noise on the recordings: for each draw one with each of SIZES.
 
-    Every number is off by its sensor's standard deviation, up or down. Signs of a sample and the next, and
-    of a channel and the next, are orthogonal over the draws, so that squares of what combines these have
-    their expectation without any scatter.
+    Every number is shifted by its sensor's standard deviation, up or down. Signs of neighbouring samples and
+    of neighbouring channels are orthogonal over the draws, so that squares of their combinations have their
+    expectation without scatter.
     """
     world, sensor = given.frame.world, given.frame.arrays.sensor
     place = (np.arange(world.t.shape[1])[:, None] + np.arange(4)) % len(SIGNS)
@@ -216,9 +230,14 @@ def redrawn(given: Problem) -> tuple[Problem, ...]:
 
 
 def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], np.ndarray]) -> np.ndarray:
-    """What noise makes of columns (n, M), (D, n, M) draws, from those `on` the redrawn recordings.
+    """Draws (D, n, M) of the error that noise causes in columns (n, M).
 
-    Where it does not act in proportion, as next to a contact that it makes or breaks, it is undetermined.
+    Zero where it is not proportional to the noise, as next to a contact that the noise makes or breaks.
+
+    Args:
+        columns: The columns on the recordings.
+        others: Redrawn recordings.
+        on: Gives the columns on one of them.
     """
     changes = [(on(other) - columns) / size for other, size in zip(others, SIZES * len(SIGNS.T), strict=True)]
     out = []
@@ -229,15 +248,15 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
 
 
 def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitted:
-    """A fit's residual and derivatives at the same coordinates on another recording; `usual`: those by the
-    properties, where they are known."""
-    at = cost_at(other, f.effects, f.u, f.columns, [])
-    now = evaluated(other, f.effects, f.u, f.columns, at, usual)
-    return replace(f, residual=now.residual, push=now.push)
+    """Evaluate a fit at the same coordinates on another recording.
+
+    `usual` are the derivatives with respect to the properties, if known.
+    """
+    return evaluated(other, f.effects, f.u, f.columns, usual)
 
 
 def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float:
-    """What a fit gains [nats] over the one without effects by leaving less of the sensors' noise."""
+    """Gain of a fit [nats] over the one without effects because it leaves less of the sensor noise."""
     columns = np.stack([healthy.residual, f.residual], 1)
     noise = carried(
         columns,
@@ -248,13 +267,14 @@ def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float
     return 0.5 * float(without - left)
 
 
-SHOWN = 1.0  # chosen: squared residual [noise's] of a property as wrong as usual, above which it shows at all
+# chosen: squared residual [noise's] from a usual error of a property, above which it shows at all
+SHOWN = 1.0
 
 
 def rows_of(given: Problem) -> Rows:
-    """What each residual is, cells in the order of time."""
-    frame, there = given.frame, given.whitening.weight > 0
-    trial, sample, channel = np.nonzero(there)
+    """What each residual is; cells are in order of time."""
+    frame = given.frame
+    trial, sample, channel = np.nonzero(given.there)
     return Rows(
         trial, channel, frame.arrays.subtask[trial, sample], frame.world.t[trial, sample],
         frame.files, CHANNELS, tuple(f"{k}:{s.label}" for k, s in enumerate(frame.steps)), BANDS,
@@ -268,20 +288,27 @@ def gap_of(
     scatters: Sequence[Scatter] = (),
     redrawn: Sequence[Problem] = (),
 ) -> Gap:
-    """The gap with a candidate for every fit (of one effect each) and scatter, and for properties that were
-    measured apart. What sensors' noise makes of them is seen on `redrawn` recordings."""
+    """The gap with a candidate for every fit (of one effect each), scatter, and property measured apart.
+
+    Args:
+        given: The problem.
+        healthy: Its fit without effects.
+        fits: Fits of one effect each.
+        scatters: Random effects.
+        redrawn: Recordings with additional noise, which show how noise affects the candidates.
+    """
     rows = with_noise(given, rows_of(given), given.nuisances.left(healthy.residual))
     usual = given.frame.rig.tolerance == Tolerance()
     scattering, tolerance = [_scattering(s, rows) for s in scatters], tolerated(given)
-    # Which properties show is decided here alone: with more noise on the recordings others might.
+    # Decided here once: with additional noise on the recordings others might show.
     measured = _measured(given, healthy)
     seen = {c.parameters for c in measured if np.square(c.jacobian * c.scale).sum() > SHOWN}
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
         k = problem.num_properties
-        start = healthy.residual - healthy.push @ healthy.u[:k]
-        nuisance = np.concatenate([-healthy.push, problem.nuisances.columns], 1)
-        shifting = [_shifting(problem, f, start, healthy.push, healthy.doubts) for f in fits]
+        start = healthy.residual - healthy.jacobian @ healthy.u[:k]
+        nuisance = np.concatenate([-healthy.jacobian, problem.nuisances.columns], 1)
+        shifting = [_shifting(problem, f, start, healthy.jacobian, healthy.doubts) for f in fits]
         measured = [c for c in _measured(problem, healthy) if c.parameters in seen]
         every = (*shifting, *scattering, *measured)
         return Gap(rows, start, nuisance, every, tolerance=tolerance, usual=usual)
@@ -292,7 +319,7 @@ def gap_of(
 
     def on(other: Problem) -> np.ndarray:
         plain = on_other(other, healthy)
-        return at(other, plain, [on_other(other, f, plain.push) for f in fits]).raw_columns
+        return at(other, plain, [on_other(other, f, plain.jacobian) for f in fits]).raw_columns
 
     return replace(gap, carried=carried(gap.raw_columns, redrawn, on))
 
@@ -300,7 +327,7 @@ def gap_of(
 def _measured(given: Problem, healthy: Fitted) -> list[Candidate]:
     """A candidate for each property that was measured apart."""
     wrong = [e.wrong for e in catalogue().values() if e.wrong is not None]
-    return [c for candidates in wrong for c in candidates(given, healthy.push)]
+    return [c for candidates in wrong for c in candidates(given, healthy.jacobian)]
 
 
 def together(
@@ -311,10 +338,10 @@ def together(
     left: Sequence[Scatter] = (),
     redrawn: Sequence[Problem] = (),
 ) -> Gap:
-    """The gap with further candidates: the effects of a joint fit, linearised where they are together.
+    """Add the effects of a joint fit as candidates, linearised where they act together.
 
-    Each shifts the residual by what leaving it out changes; what they do only together is parted evenly.
-    What scatters is as large as it is in what they leave (`left`).
+    The shift of each is the change from leaving it out; what they do only together is divided evenly. Random
+    effects take their size in what the joint fit leaves (`left`).
     """
     anew = {s.effect: _scattering(s, gap.rows) for s in left}
     gap = replace(gap, candidates=tuple(anew.get(c.name, c) for c in gap.candidates))
@@ -329,23 +356,23 @@ def together(
 
 
 def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
-    """The effects of a joint fit as candidates of their own."""
-    k, there = given.num_properties, given.whitening.weight > 0
-    # What all of them take off.
-    all_of_them = healthy.residual - joint.residual - healthy.push @ (healthy.u[:k] - joint.u[:k])
+    """The effects of a joint fit as separate candidates."""
+    k = given.num_properties
+    # The shift by all of them.
+    all_of_them = healthy.residual - joint.residual - healthy.jacobian @ (healthy.u[:k] - joint.u[:k])
     alone = []
     for key in joint.effects:
         u = joint.u.copy()
         own = columns_of(given, (key,))[k:]
         u[own] = neutral(given)[own]
         rest = tuple(e for e in joint.effects if e != key)
-        alone.append(residual_at(given, rest, u)[there] - joint.residual)
+        alone.append(residual_at(given, rest, u)[given.there] - joint.residual)
     both, doubts = (all_of_them - sum(alone)) / len(alone), (joint.doubts - healthy.doubts) / len(alone)
     out, at = [], k
     for key, shift in zip(joint.effects, alone, strict=True):
         free = free_of(key)
         out.append(_candidate(given, key, joint.columns[at : at + len(free)], joint.u, shift + both,
-                              joint.push[:, at : at + len(free)], doubts))  # fmt: skip
+                              joint.jacobian[:, at : at + len(free)], doubts))  # fmt: skip
         at += len(free)
     return out
 
@@ -354,33 +381,33 @@ def after(
     given: Problem, gap: Gap, healthy: Fitted, first: Fitted, joint: Sequence[Fitted],
     redrawn: Sequence[Problem],
 ) -> Gap:  # fmt: skip
-    """The gap with further candidates: the last effects of joint fits, linearised after the `first` one.
+    """Add the last effects of joint fits as candidates, linearised after the `first` effect.
 
-    Each shifts the residual by what its fit takes off beyond what the first does there.
+    The shift of each is what its fit removes in excess of the first effect's shift there.
     """
 
     def of(problem: Problem, healthy: Fitted, first: Fitted, joint: Sequence[Fitted]) -> Gap:
         k, own = problem.num_properties, []
-        start = healthy.residual - healthy.push @ healthy.u[:k]
-        one = _shifting(problem, first, start, healthy.push, healthy.doubts)
+        start = healthy.residual - healthy.jacobian @ healthy.u[:k]
+        one = _shifting(problem, first, start, healthy.jacobian, healthy.doubts)
         for f in joint:
-            both = start - (f.residual - healthy.push @ f.u[:k])
+            both = start - (f.residual - healthy.jacobian @ f.u[:k])
             known = one.shift + one.jacobian @ (f.u[first.columns[k:]] - one.at)
             mine = slice(first.columns.size, None)
             own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - known,
-                                  f.push[:, mine], f.doubts - first.doubts))  # fmt: skip
+                                  f.jacobian[:, mine], f.doubts - first.doubts))  # fmt: skip
         return replace(gap, candidates=(*gap.candidates, *own))
 
     def on(other: Problem) -> Gap:
         plain = on_other(other, healthy)
-        one, *others = (on_other(other, f, plain.push) for f in (first, *joint))
+        one, *others = (on_other(other, f, plain.jacobian) for f in (first, *joint))
         return of(other, plain, one, others)
 
     return _carrying(gap, of(given, healthy, first, joint), redrawn, on)
 
 
 def _carrying(gap: Gap, more: Gap, redrawn: Sequence[Problem], on: Callable[[Problem], Gap]) -> Gap:
-    """A gap with `more` candidates, and with what sensors' noise makes of these."""
+    """Add the effect of sensor noise on the new candidates of `more`."""
     if gap.carried is None:
         return more
     kept = gap.carried.shape[2]
@@ -389,14 +416,15 @@ def _carrying(gap: Gap, more: Gap, redrawn: Sequence[Problem], on: Callable[[Pro
 
 
 def _turning(given: Problem, angle: float) -> np.ndarray:
-    """Variance (n,) of cosine coefficients where standing blocks turn in the grip by up to an angle [rad].
+    """Additional variance (n,) of cosine coefficients if standing blocks turn in the grip by up to an angle
+    [rad].
 
-    It shows in the fingers' distance and offset, and in their height, but not in its mean: there the block
-    stands.
+    It shows in the distance and offset of the fingers, and in their height except for its mean, at which the
+    block stands.
     """
-    rows, weight, arrays = rows_of(given), given.whitening.weight, given.frame.arrays
+    rows, there, arrays = rows_of(given), given.there, given.frame.arrays
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
-    size, there = weight * (angle * width)[..., None], weight > 0
+    size = given.weight * (angle * width)[..., None]
     stands = arrays.phase[..., [Phase.PICKUP, Phase.PLACE]].sum(-1) > 0
     stands = np.repeat(stands[..., None], len(CHANNELS), -1)[there]
     mean = np.zeros(stands.size, bool)
@@ -405,12 +433,14 @@ def _turning(given: Problem, angle: float) -> np.ndarray:
     return np.square(size[there]) * (stands & (distance | offset | (y & ~mean)))
 
 
-def _shifting(given: Problem, f: Fitted, start: np.ndarray, push: np.ndarray, usual: float) -> Candidate:
-    """A fit as a candidate: what it takes off the residual, at properties' own nominal; `usual` [nats]: the
-    doubts without it."""
+def _shifting(given: Problem, f: Fitted, start: np.ndarray, jacobian: np.ndarray, usual: float) -> Candidate:
+    """A fit as a candidate: its shift at the properties' own nominal values.
+
+    `usual` is the cost of doubts without the effect [nats].
+    """
     k = given.num_properties
-    shift = start - (f.residual - push @ f.u[:k])
-    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.push[:, k:], f.doubts - usual)
+    shift = start - (f.residual - jacobian @ f.u[:k])
+    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.jacobian[:, k:], f.doubts - usual)
 
 
 def _candidate(
@@ -419,16 +449,16 @@ def _candidate(
     own: np.ndarray,
     u: np.ndarray,
     shift: np.ndarray,
-    push: np.ndarray,
+    jacobian: np.ndarray,
     doubts: float,
 ) -> Candidate:
-    """One form of an effect at coordinates u, of which it has the columns `own`."""
+    """One form of an effect as a candidate, linearised at coordinates u; `own` are its columns among them."""
     free, effect = free_of(key), catalogue()[name_of(key)]
     low, high = (edge[own] for edge in limits(given))
     turned = sum(float(p.value(u[c])) for p, c in zip(free, own, strict=True) if p.name == effect.turns)
     return Candidate(
         effect.name, tuple(p.name for p in free), u[own], neutral(given)[own], np.ones(own.size), shift,
-        -push,
+        -jacobian,
         low, high, evidence=-doubts,
         form=RESPONSE if effect.exact else MODELLED,
         hidden=tuple(p.name for p in free if p.hidden or p.shape),
@@ -438,9 +468,9 @@ def _candidate(
 
 
 def _scattering(s: Scatter, rows: Rows) -> Candidate:
-    """What scatters as a candidate; its variance over that of the noise as it is in these rows.
+    """A random effect as a candidate, its variance relative to the noise of these rows.
 
-    One whose size is not the same everywhere is an imitation, which nothing speaks for.
+    If its size is not the same everywhere it is an imitation and cannot be the cause.
     """
     nothing, count = np.zeros(0), s.variance.size
     variance = s.variance / (1.0 if rows.sd is None else np.square(rows.sd))
@@ -448,28 +478,28 @@ def _scattering(s: Scatter, rows: Rows) -> Candidate:
                      nothing, variance, s.known if s.same else -np.inf, frees=s.frees)  # fmt: skip
 
 
-# Forces rounded to a step: by how much every residual that they enter is in doubt.
+# Forces rounded to a step: the variance of every residual that they enter.
 #
-# A rounded reading is off by up to half a step, with a variance of step^2 / 12. While it stays on one level
-# it is off by the same, or, as a force passes slowly through the level, by what changes evenly from one half
-# to the other: errors within a plateau are alike or as good as independent (Widrow & Kollar, Quantization
-# Noise, 2008, ch. 1 on slow signals). One is as likely here as the other. Through the pads that give,
-# forces' errors are those of distances as well.
+# A rounded reading is off by up to half a step, with variance step^2 / 12. While it stays on one level the
+# error is constant or, as a force passes slowly through the level, changes evenly from one half step to the
+# other: errors within a plateau are alike, or practically independent (Widrow & Kollar, Quantization Noise,
+# 2008, ch. 1 on slow signals). Here both are equally likely. Through the pads' compliance errors of forces
+# are errors of distances as well.
 
-TOGETHER = 0.5  # prior: share of a plateau's errors that are alike throughout it
+TOGETHER = 0.5  # prior: share of the error that is constant within a plateau
 
 
 def rounded_variance(given: Problem, step: float) -> np.ndarray:
-    """Variance (n,) of the cosine coefficients of each cell, in the noise's, of forces rounded to `step` [N].
+    """Variance (n,) of the cosine coefficients of each cell from forces rounded to `step` [N], over the
+    noise's.
 
-    Coefficients are in the order of `assemble.rows_of`.
+    Coefficients are in the order of `rows_of`.
     """
-    frame, there = given.frame, given.whitening.weight > 0
-    rows, sample, scale = rows_of(given), np.nonzero(there)[1], given.whitening.weight[there]
+    frame, there = given.frame, given.there
+    rows, sample, scale = rows_of(given), np.nonzero(there)[1], given.weight[there]
     shares, out = _shares(given), np.zeros(scale.size)
     levels = [_plateaus(force) for force in frame.forces]
-    order = np.argsort(rows.cell, kind="stable")
-    for mine in np.split(order, np.flatnonzero(np.diff(rows.cell[order])) + 1):
+    for mine in rows.by_cell():
         trial, of_channel = rows.trial[mine[0]], shares[:, rows.channel[mine[0]]]
         group = frame.groups[trial]
         for k in np.flatnonzero(of_channel):
@@ -481,7 +511,7 @@ def rounded_variance(given: Problem, step: float) -> np.ndarray:
 
 
 def _shares(given: Problem) -> np.ndarray:
-    """How much (4, C) of each force's error every channel has: net forces, and what pads give."""
+    """Coefficients (4, C) of each force's error in every channel: net forces, and the pads' compression."""
     world, out = given.frame.world, np.zeros((4, len(CHANNELS)))
     for axis, give, place, apart, net, half in (
         (0, world.give_normal, "x", "distance", "fx", "grip"),
@@ -496,12 +526,12 @@ def _shares(given: Problem) -> np.ndarray:
 
 
 def _plateaus(force: np.ndarray) -> np.ndarray:
-    """The number (N, 4) of the plateau that each reading is on."""
+    """Number (N, 4) of the plateau of each reading."""
     return np.cumsum(np.diff(force, axis=0, prepend=force[:1]) != 0, axis=0)
 
 
 def _on_plateaus(level: np.ndarray, sample: np.ndarray, group: int) -> np.ndarray:
-    """Share (m, R) of the readings behind each of m samples that is on each of R plateaus."""
+    """Share (m, R) of the readings averaged into each of m samples that is on each of R plateaus."""
     mine = level[sample[:, None] * group + np.arange(group)]
     number = mine - mine.min()
     out = np.zeros((sample.size, int(number.max()) + 1))

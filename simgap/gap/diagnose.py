@@ -1,4 +1,4 @@
-"""The diagnosis: is there a gap, where, which effects cause it, how far it shrinks."""
+"""The diagnosis: whether there is a gap, where, which effects cause it, and how far it shrinks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from simgap.gap.frame import CHANNELS, check_forced, of_wrist
 from simgap.gap.problem import (
     Fitted,
     Problem,
-    Start,
     columns_of,
     fit,
     properties_tolerated,
@@ -34,6 +33,7 @@ from simgap.gap.problem import (
     residual_at,
     world_without,
 )
+from simgap.gap.residuals import net_forces
 from simgap.gap.search import PROMISING, Identified, Search, best_fit, search
 from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.progress import Progress, silent
@@ -41,14 +41,14 @@ from simgap.report.finding import sentence, tables
 
 # Where a gap lies: cells whose residuals show it, and those whose signals the named causes shift.
 
-# cited: sds of a sample: mean shift of a cell that counts as shifted (the interface's definition)
+# cited: sds of a sample; mean shift at which a cell counts as shifted (the interface's definition)
 SHIFTED = 3.0
 
 
 def where(given: Problem, found: Sequence[Cell], causes: Fitted | None) -> list[dict[str, Any]]:
-    """Rows of the document: significant cells and those that the causes shift, largest share first.
+    """Entries for the significant cells and those that the causes shift, largest share first.
 
-    Shares are of the excess that residuals show: a shift that the properties absorb has none.
+    Shares are of the excess squares; a shift that the properties absorb has none.
     """
     frame = given.frame
     out = [{**row, "subtask": row["subtask"].partition(":")[2]} for row in rows(found)]
@@ -64,44 +64,15 @@ def where(given: Problem, found: Sequence[Cell], causes: Fitted | None) -> list[
     return out
 
 
-@dataclass(frozen=True)
-class Tally:
-    """Squared whitened residual of a trial's channel in a subtask over its `count`, as a normal score `z`."""
-
-    trial: int
-    channel: str
-    subtask: int
-    energy: float
-    count: int
-    z: float
-
-
-def tallies(given: Problem, z: np.ndarray) -> tuple[Tally, ...]:
-    """All cells of whitened residuals z (T, N, C) that hold anything."""
-    frame, out = given.frame, []
-    there = given.whitening.weight > 0
-    for r in range(frame.num_trials):
-        for s in range(len(frame.steps)):
-            inside = frame.arrays.subtask[r] == s
-            for c, channel in enumerate(CHANNELS):
-                values = z[r, inside & there[r, :, c], c]
-                if values.size:
-                    energy, n = float(values @ values), values.size
-                    # Wilson & Hilferty, PNAS 17, 1931
-                    score = (np.cbrt(energy / n) - (1 - 2 / (9 * n))) / np.sqrt(2 / (9 * n))
-                    out.append(Tally(r, channel, s, energy, n, float(score)))
-    return tuple(out)
-
-
 def shifts(given: Problem, causes: Fitted) -> np.ndarray:
-    """Mean shift (T, S, C) of a cell under effects, in noise of one sample.
+    """Mean shift (T, S, C) of each cell by effects, in standard deviations of one sample.
 
-    What acts on sensors or kinematics shifts what is recorded. What acts on contact or dynamics shows in the
-    equations of the contact as well; the larger of the two counts.
+    Effects on sensors or kinematics shift what is recorded. Those on contact or dynamics also violate the
+    contact equations; the larger of the two shifts counts.
     """
     frame, u = given.frame, causes.u
     change = np.abs(channels(frame.world) - channels(world_without(given, causes.effects, u)))
-    there = given.whitening.weight > 0
+    there = given.there
     read = ("sensing", "kinematics")
     mechanical = [e for e in causes.effects if catalogue()[name_of(e)].acts_on not in read]
     violated = np.zeros_like(change)
@@ -121,31 +92,46 @@ def shifts(given: Problem, causes: Fitted) -> np.ndarray:
 
 
 def channels(world: World) -> np.ndarray:
-    """Task-space channels (T, N, C) of a world: x, y, distance, offset, vx, vy, fx, fy, grip, shear."""
-    (position, velocity), force = tips(world), world.force
+    """Task-space channels (T, N, C) of a world, in the order of CHANNELS."""
+    position, velocity = tips(world)
     mean, apart = (position[..., :2] + position[..., 2:]) / 2, position[..., 2:] - position[..., :2]
     speed = (velocity[..., :2] + velocity[..., 2:]) / 2
-    net, half = force[..., :2] + force[..., 2:], (force[..., :2] - force[..., 2:]) / 2
-    return np.concatenate([mean, apart, speed, net, half], -1)
+    return np.concatenate([mean, apart, speed, net_forces(world.force)], -1)
 
 
-# An attribution in the words of the interface.
+# The attribution as the interface describes it.
 
-DRAWS = 2000  # numerics: of the posterior, for intervals
+DRAWS = 2000  # numerics: draws of the posterior, for intervals
 LISTED = 8  # look: effects that are described
 
 
 def body(
     found: Search, verdict: Attribution, causes: Fitted | None, following: dict | None, seed: int
 ) -> dict[str, Any]:
-    """The JSON document of a diagnosis; `causes`: the joint fit of the named effects that shift signals."""
+    """The JSON document of a diagnosis.
+
+    Args:
+        found: The search.
+        verdict: The attribution.
+        causes: Joint fit of the named effects that shift signals.
+        following: Entry of the next experiment.
+        seed: Of the draws behind intervals.
+    """
     given, posterior = found.problem, verdict.effects
     named = {n: e for n, e in posterior.items() if n in catalogue()}
     ranked = sorted(named, key=lambda n: -named[n].probability)
     shown = [
         n for k, n in enumerate(ranked) if k < LISTED or n in verdict.causes or n in verdict.indistinguishable
     ]
-    effects = {n: _described(found, verdict, n, seed) for n in shown}
+    effects: dict[str, dict[str, Any]] = {
+        n: {
+            "parameters": parameters(found, posterior[n], n, seed),
+            "log_evidence": log_odds([posterior[n].probability]),
+            "heldout_score": None,
+            "property_shift": {},
+        }
+        for n in shown
+    }
     if len(verdict.causes) > 1:
         effects["+".join(verdict.causes)] = {
             "parameters": {
@@ -177,23 +163,13 @@ def body(
 
 
 def _unit_of_noise(found: Search, channel: str) -> float:
-    """A residual's usual noise in the channel's unit."""
+    """Median noise of a channel's residuals, in its unit."""
     arrays, c = found.problem.frame.arrays, CHANNELS.index(channel)
     return float(np.median(arrays.sd[..., c][arrays.there[..., c] > 0]))
 
 
-def _described(found: Search, verdict: Attribution, name: str, seed: int) -> dict[str, Any]:
-    """Parameters and evidence of one effect."""
-    return {
-        "parameters": parameters(found, verdict.effects[name], name, seed),
-        "log_evidence": log_odds([verdict.effects[name].probability]),
-        "heldout_score": None,
-        "property_shift": {},
-    }
-
-
 def parameters(found: Search, posterior: EffectPosterior, name: str, seed: int) -> dict[str, Any]:
-    """An effect's parameters as the interface names them."""
+    """Parameters of an effect as the interface names them."""
     every = drawn(found, posterior, name, seed)
     return {key: _summary(values, unit) for key, (values, unit) in every.items()}
 
@@ -201,8 +177,7 @@ def parameters(found: Search, posterior: EffectPosterior, name: str, seed: int) 
 def drawn(
     found: Search, posterior: EffectPosterior, name: str, seed: int
 ) -> dict[str, tuple[np.ndarray, str]]:
-    """Draws (DRAWS,) of an effect's parameters given that it acts, and their units, as the interface names
-    them."""
+    """Draws (DRAWS,) of an effect's parameters, given that it acts, and units, as the interface has them."""
     effect, rng = catalogue()[name], np.random.default_rng(seed)
     of = effect.parameters
     scatter = next((s for s in found.scatters if s.effect == name), None)
@@ -212,7 +187,7 @@ def drawn(
     draws = {}
     for key, p in posterior.parameters.items():
         u = p.mean + p.sd * rng.standard_normal(DRAWS)
-        if key not in of:  # by how much a property was measured too large
+        if key not in of:  # error of a measured property
             obj, kind = key.rsplit(".", 1)
             one = found.problem.sd[found.problem.frame.task.objects.index(obj), PROPERTIES.index(kind)]
             return {key: (-u * float(one), UNITS[kind])}
@@ -223,16 +198,18 @@ def drawn(
 
 
 def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
+    """Median, standard deviation and 90 % interval of draws."""
     low, high = np.percentile(values, (5, 95))
     return {"mean": float(np.median(values)), "sd": float(np.std(values)),
             "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
 
 
 def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
-    """Properties with rig.toml at its word and with the causes, of those that were identified or measured.
+    """Identified or measured properties with rig.toml taken at its word (`before`) and with the causes
+    (`after`).
 
-    Both are of one model, pads included, so that either can be simulated; what `identify` says is of a rig
-    that may be wrong by what it doubts (`estimation.sampler`), and stands between them.
+    Both are of one model, pads included, so that either can be simulated. The result of `identify`, which
+    allows for the rig's stated uncertainty (`estimation.sampler`), lies between them.
     """
     if causes is None:
         return {}
@@ -246,16 +223,22 @@ def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
     }
 
 
-STAGES = 12  # look: that `progress` reports, at most
-NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, twins or none
+STAGES = 12  # look: most stages that `progress` reports
+NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, with twins or without
 
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis(Tabled):
-    """Everything found; `body` is the JSON document's. Arrays are for figures and tests.
+    """The diagnosis of aligned recordings.
 
-    `before`, `after` (T, N, C): whitened residuals without and with the verdict's effects, `cells` the first
-    by trial, channel and subtask; `causes`: the fit of those effects that shift signals.
+    Attributes:
+        body: The JSON document.
+        search: Every candidate's fit.
+        causes: Fit of the verdict's effects that shift signals.
+        attribution: The verdict and what it rests on.
+        before, after: Whitened residuals (T, N, C) without and with these effects.
+        warnings: One line each.
+        seed: Of the draws behind intervals.
     """
 
     body: dict[str, Any]
@@ -264,13 +247,12 @@ class Diagnosis(Tabled):
     attribution: Attribution
     before: np.ndarray
     after: np.ndarray
-    cells: tuple[Tally, ...]
     warnings: tuple[str, ...] = ()
     seed: int = 0
 
     @property
     def problem(self) -> Problem:
-        """Aligned trials and their whitening."""
+        """The fitting problem: aligned trials, noise and priors."""
         return self.search.problem
 
     def to_json(self) -> dict[str, Any]:
@@ -282,12 +264,14 @@ class Diagnosis(Tabled):
         return sentence(self.body)
 
     def tables(self):
-        """Probabilities, parameters of the causes, the largest cells."""
+        """Tables of the probabilities, the causes' parameters, and the largest cells."""
         return tables(self.body)
 
     def to_arviz(self):
-        """ArviZ InferenceData: draws of the described effects' parameters, `effect.parameter`, given that it
-        acts. Each effect is drawn by itself."""
+        """ArviZ InferenceData: draws `effect.parameter` of each described effect, given that it acts.
+
+        Each effect is drawn separately.
+        """
         from estimation.report import inference_data
 
         every = {
@@ -301,14 +285,16 @@ class Diagnosis(Tabled):
         return inference_data(every)
 
     def plot_where(self, path: str | Path | None = None):
-        """Share of the gap by channel and subtask; the axes. Saved where a path is given."""
+        """Plot the share of the gap by channel and subtask; returns the axes and saves them if a path is
+        given.
+        """
         from simgap.report.figures import draw_heat_map
 
         names = dict.fromkeys(step.label for step in subtasks(self.problem.frame.task))
         return draw_heat_map(self.body, list(names), None if path is None else Path(path))
 
     def plot_causes(self, path: str | Path | None = None):
-        """Whether each effect acts and what share of the gap it explains; the axes."""
+        """Plot the probability of each effect and the share of the gap it explains; returns the axes."""
         from simgap.report.figures import draw_suspects
 
         return draw_suspects(self.body, None if path is None else Path(path))
@@ -328,11 +314,19 @@ def diagnose(
 ) -> Diagnosis:
     """Diagnose aligned recordings of one block task against the nominal model.
 
-    `actual` as `estimation.report.read_actual` gives it; `forced` names effects to be taken instead of
-    choosing; `excluded` effects are not thought of. The null are `healthy` recordings of the same task and
-    rig if there are any, else simulated `twins`, else the model itself. `identified`: what `identify` made
-    of the same trials, where that is known already. InputError where no trial fits its task, or no effect has
-    a forced name or could act on these recordings.
+    Args:
+        aligned: The recordings.
+        actual: Measured properties as `estimation.report.read_actual` returns them.
+        forced: Effects that are imposed instead of chosen.
+        seed: Of twins and draws.
+        progress: Called with a description of each stage.
+        twins: Whether simulated healthy twins are the null; without them the stated noise is.
+        healthy: Healthy recordings of the same task and rig, which replace the twins.
+        excluded: Effects that are not considered.
+        identified: Properties identified from the same trials, if known.
+
+    Raises:
+        InputError: No trial fits its task, or a forced effect is unknown or cannot act on these recordings.
     """
     tell = progress or silent
     forced = tuple(effect_named(name).name for name in dict.fromkeys(forced))
@@ -360,12 +354,11 @@ def diagnose(
         warnings = (*warnings, "one trial: an accident of it looks like an effect")
     before = residual_at(found.problem, (), found.healthy.u)
     after = residual_at(found.problem, causes.effects, causes.u)
-    cells = tallies(found.problem, before)
-    return Diagnosis(document, found, causes, verdict, before, after, cells, warnings, seed)
+    return Diagnosis(document, found, causes, verdict, before, after, warnings, seed)
 
 
 def _inseparable(verdict: Attribution, following: dict[str, Any] | None) -> list[str]:
-    """What no experiment is expected to tell from the causes, if there is any."""
+    """A warning that names effects that no listed experiment is expected to separate from the causes."""
     left = sorted(set(verdict.indistinguishable) - set([] if following is None else following["separates"]))
     if not left:
         return []
@@ -380,7 +373,14 @@ def attributed(
     seed: int = 0,
     twins: Callable[[float], Iterable[float]] | None = None,
 ) -> tuple[Gap, Attribution]:
-    """The attribution of a search, effects that act together linearised where they do."""
+    """Attribute the gap of a search, with effects that act together linearised where they do.
+
+    Args:
+        found: The search.
+        forced: Effects that are imposed instead of chosen.
+        seed: Of the draws behind intervals.
+        twins: Gives statistics of healthy twins for that of the gap.
+    """
     f, gap = forms(found.gap), found.gap
     models: list[Model] | None = sought(f)
     if not forced:
@@ -398,8 +398,11 @@ def attributed(
 
 
 def _after_first(found: Search, f: Forms, models: list[Model]) -> tuple[Gap, list[Model]]:
-    """The gap and its sets with every effect fitted after the first of the leading set, where this one alone
-    leaves a gap: what another distorts looks like others by itself."""
+    """The gap and its sets, with every effect fitted after the first of the best set if that alone leaves a
+    gap.
+
+    Fitted separately, what another effect distorts resembles further effects.
+    """
     gap, best = f.gap, models[0]
     shifting = [j for j in best.effects if _shifts_signals(gap.candidates[j])]
     first = min(shifting, key=lambda j: fitted(f, tuple(i for i in best.effects if i != j)).score, default=-1)
@@ -414,21 +417,21 @@ def _after_first(found: Search, f: Forms, models: list[Model]) -> tuple[Gap, lis
 
 
 def _shifts_signals(c: Candidate) -> bool:
-    """Whether a candidate shifts signals, rather than scattering them or being about a measurement."""
+    """Whether a candidate shifts signals, rather than scattering them or concerning a measurement."""
     return bool(c.parameters) and catalogue()[c.name].correct is not None
 
 
 def _together(found: Search, which: Sequence[Candidate]) -> Fitted:
-    """Some candidates joined: fitted together from where each was linearised."""
+    """Fit candidates jointly, from where each was linearised."""
     u, keys = found.healthy.u.copy(), []
     for c in which:
         keys.append(next(key for key in forms_of(c.name) if free_parameters(key) == c.parameters))
         u[columns_of(found.problem, keys[-1:])[found.problem.num_properties :]] = c.at
-    return fit(found.problem, Start(tuple(keys), u))
+    return fit(found.problem, tuple(keys), u)
 
 
 def _causes(found: Search, gap: Gap, verdict: Attribution) -> Fitted:
-    """The fit of the verdict's effects that shift signals, in the forms that they were found in."""
+    """The joint fit of the verdict's effects that shift signals, in the forms in which they were found."""
     named = [gap.candidates[verdict.effects[name].candidate] for name in verdict.causes]
     shifting = [c for c in named if _shifts_signals(c)]
     return _together(found, shifting) if shifting else found.healthy

@@ -1,14 +1,14 @@
 """The next experiment: which of a short list would separate the leading cause from its partners.
 
-Every experiment is simulated with the leading cause in it, and cause and partners are fitted to what it would
-record. The gain expected of a partner is by how much it would then fit worse: the divergence after properties
-have done their best (Chaloner & Verdinelli, Statist. Sci. 10, 1995), for as many trials as there are. Of the
-experiments that separate most partners the first of the list is taken, which needs least of the model.
+Every experiment is simulated with the leading cause, and cause and partners are fitted to its recordings. The
+expected gain over a partner is by how much it fits worse with properties refitted (Chaloner & Verdinelli,
+Statist. Sci. 10, 1995), scaled to the number of trials. Of the experiments that separate most partners the
+first of the list is chosen, which relies least on the model.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,27 +17,27 @@ from hmmseg.errors import InputError
 from hmmseg.segmentation.align import align
 from simgap.effects import catalogue, forms_of, name_of
 from simgap.gap.frame import build
-from simgap.gap.problem import Start, fit, neutral, problem
+from simgap.gap.problem import fit, neutral, problem
 from simgap.gap.search import Search, best_fit
-from simgap.gap.twins import blocks_of, performed, recorded
+from simgap.gap.twins import Values, blocks_of, performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.simulate import task_table
 
-TRIALS = 2  # numerics: that are simulated: where contacts fall between samples is chance
+TRIALS = 2  # numerics: simulated trials: where contacts fall between samples is chance
 ENOUGH = 5.0  # physics: a definition: nats, the detection floor
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What to do, the operator's settings that do it, and whether the blocks are measured apart."""
+    """What to do, the operator settings that do it, and whether blocks are measured apart."""
 
     do: str
     operator: dict[str, tuple[float, float]] = field(default_factory=dict)
     measured: bool = False
 
 
-# Those whose outcome needs least of the model first: fast work needs most of it.
+# Experiments that rely least on the model come first: fast work relies on it most.
 EXPERIMENTS = (
     Experiment(
         "weigh the blocks and measure them with calipers, and give the values with --actual", {}, True
@@ -54,16 +54,23 @@ EXPERIMENTS = (
     Experiment("grip with 4 to 5 N and press down with 3 N", {"grip": (4.0, 5.0), "press": (2.5, 3.5)}),
     Experiment("work twice as fast", {"pace": (1.8, 2.0)}),
 )
-Values = Mapping[str, Mapping[str, float]]
 
 
 def next_experiment(
     found: Search, cause: Values, partners: Sequence[str], seed: int, actual: Actual | None = None
 ) -> dict[str, Any] | None:
-    """The experiment that separates most partners from the cause by ENOUGH nats; None where none does.
+    """Choose the experiment that separates most partners from the cause by ENOUGH nats.
 
-    `cause` holds the parameters of each effect that acts, as the interface names them. `separates` lists the
-    cause and the partners separated from it, `expected_gain_nats` the least gain of these.
+    Args:
+        found: The search.
+        cause: Parameters of each effect that acts, as the interface names them.
+        partners: Effects to be separated from it.
+        seed: Of the simulated trials.
+        actual: Measured properties.
+
+    Returns:
+        The document's entry: `separates` lists the cause and the partners separated from it, and
+        `expected_gain_nats` is the smallest of their gains. None if no experiment separates any.
     """
     try:
         blocks = blocks_of(found)
@@ -75,7 +82,7 @@ def next_experiment(
             continue
         try:
             gains = _gains(found, experiment, blocks, cause, partners, seed, actual)
-        except (InputError, ValueError, KeyError):  # what cannot be simulated on this rig
+        except (InputError, ValueError, KeyError):  # cannot be simulated on this rig
             continue
         sure = {p: g for p, g in gains.items() if g > ENOUGH}
         if len(sure) > len(separated):
@@ -97,7 +104,7 @@ def _gains(
     found: Search, experiment: Experiment, blocks: Blocks, cause: Values, partners: Sequence[str], seed: int,
     actual: Actual | None,
 ) -> dict[str, float]:  # fmt: skip
-    """How much worse than the cause every partner fits, for as many trials as were recorded [nats]."""
+    """How much worse each partner fits than the cause [nats], for as many trials as were recorded."""
     frame = found.problem.frame
     seeds = [seed + 77 + k for k in range(TRIALS)]
     done = performed(
@@ -106,7 +113,7 @@ def _gains(
     trials = [recorded(s, frame.task, frame.rig, cause) for s in done]
     known = _measured(blocks) if experiment.measured else actual
     planned = problem(build(align(trials, frame.task, frame.rig)), known)
-    healthy = fit(planned, Start((), neutral(planned)))
+    healthy = fit(planned, (), neutral(planned))
 
     def cost(name: str) -> float:
         if catalogue()[name].correct is None:
@@ -118,7 +125,7 @@ def _gains(
 
 
 def _measured(blocks: Blocks) -> Actual:
-    """What a balance and calipers say of blocks."""
+    """Properties of blocks as a balance and calipers measure them."""
     return {
         n: {"weight": (b.weight, 5e-4), "width": (b.width, 1e-4), "height": (b.height, 1e-4)}
         for n, b in blocks.items()

@@ -1,4 +1,4 @@
-"""Aligned trials as padded arrays: what an effect acts on and what the contact equations need."""
+"""Aligned trials as padded arrays: the world that effects change, and what the contact equations need."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from simgap.effects import catalogue, forms_of, free_parameters
 from simgap.effects.base import World
 from simgap.gap.sensor_noise import (
     between_samples,
+    changes,
     channel_noise,
     kinks,
     mean_of,
     motion_doubt,
     of_a_kink,
-    pushed,
     residual_noise,
     sample_noise,
     sensor_sd,
 )
 from simgap.phases import Phase, phase_of
 
-# What of the gap a sensor in the wrist can show: net forces and where the hand is.
+# What a sensor in the wrist can show of the gap: net forces and where the hand is.
 #
-# The channels of two fingers are made up from the wrist's (`hmmseg.hand.wrist`): each has half of the force,
-# both have one height, and velocities are derived from positions. What was made up agrees with itself and is
-# compared with nothing; effects that act on one finger or between both are not thought of.
+# The channels of two fingers are derived from the wrist's (`hmmseg.hand.wrist`): each has half of the force,
+# both are at one height, and velocities are differences of positions. Derived channels agree by construction
+# and are not compared; effects on one finger or between the two are not considered.
 
-MADE_UP = ("offset", "shear", "vx", "vy")
-GRIP = ("distance", "grip")  # without a grip force what the pads give is read off the opening itself
+DERIVED = ("offset", "shear", "vx", "vy")
+GRIP = ("distance", "grip")  # without a grip force, pads' compression is part of the opening
 NOT_COMPARED = (
     "a wrist sensor feels the sum of both fingers: net forces and positions are compared, {absent} are not, "
     "and effects on one finger or inside the grip are not thought of"
@@ -54,34 +54,38 @@ def of_wrist(trials: Sequence[Trial]) -> bool:
 
 
 def absent(trial: Trial) -> tuple[str, ...]:
-    """Channels that a trial has not, though its two made-up fingers do."""
+    """Channels that a trial lacks although its two derived fingers have them."""
     if trial.inertia is None:
         return ()
-    return (*MADE_UP, *GRIP) if "friction" in trial.hidden else MADE_UP
+    return (*DERIVED, *GRIP) if "friction" in trial.hidden else DERIVED
 
 
 def not_compared(trials: Sequence[Trial]) -> str:
-    """One line of what a diagnosis leaves out."""
+    """One line that says what a diagnosis leaves out."""
     missing = dict.fromkeys(name for trial in trials for name in absent(trial))
     return NOT_COMPARED.format(absent=", ".join(missing))
 
 
 def shown(names: Sequence[str]) -> list[str]:
-    """Effects that act on net forces or on where things are.
+    """Effects on net forces or on where things are.
 
-    Offsets, drift, drag and the tool's own mass are not among them: free motion takes them out
-    (`hmmseg.hand.tool`).
+    Offsets, drift, drag and the tool's own mass are not among them: they are estimated in free motion and
+    removed (`hmmseg.hand.tool`).
     """
     return [n for n in names if catalogue()[n].wrist]
 
 
 def shown_forms(names: Sequence[str]) -> list[str]:
-    """Keys of those forms of effects that act on both fingers alike."""
+    """Keys of the forms of effects that act on both fingers alike."""
     return [key for n in shown(names) for key in forms_of(n)[:1] if free_parameters(key)]
 
 
 def check_forced(forced: Sequence[str]) -> None:
-    """InputError for an effect that a wrist does not show."""
+    """Check that a wrist sensor shows the forced effects.
+
+    Raises:
+        InputError: One of them it does not show.
+    """
     known = shown(list(catalogue()))
     for name in forced:
         if name not in known:
@@ -90,7 +94,7 @@ def check_forced(forced: Sequence[str]) -> None:
 
 
 def as_from_wrist(trial: Trial, like: Trial) -> Trial:
-    """A simulated trial of two fingers as a wrist would give it: halves, and what is made up marked."""
+    """A simulated trial of two fingers as a wrist sensor would record it, with derived channels marked."""
     c = dict(trial.channels)
     for axis in "xy":
         half = (c[f"f{axis}1"] + c[f"f{axis}2"]) / 2
@@ -102,23 +106,23 @@ def as_from_wrist(trial: Trial, like: Trial) -> Trial:
     return replace(trial, channels=c, inertia=np.zeros((trial.t.size, 2)), hidden=like.hidden)
 
 
-# One aligned trial as arrays over its samples: signals, states, noise, and which equations hold where.
+# One aligned trial as arrays over its samples: signals, states, noise, and where each equation holds.
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 OFFSET, NET, FORCES, GRIP_FORCE = 3, slice(6, 8), slice(6, 10), 8  # physics: places among CHANNELS
-BORNE = ("x", "y", "fx", "fy")  # channels whose equations tell a block on its support from one in the air
-LOST = 0.05  # chosen: share of the grip on either side below which all forces of a sample are nothing
+BORNE = ("x", "y", "fx", "fy")  # channels whose equations distinguish a supported block from a lifted one
+LOST = 0.05  # chosen: share of the neighbouring grip forces below which a sample's forces are lost
 MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
-# chosen: chance of a boundary to lie beyond a sample from which that sample is of neither side
+# chosen: probability that a boundary lies beyond a sample above which the sample belongs to neither side
 EITHER_SIDE = 0.02
-FIRST_TOUCH = 0.2  # chosen: s; one finger touches no earlier before the other, nor lets go later
+FIRST_TOUCH = 0.2  # chosen: s; longest time between the two fingers' touches, or releases
 
 
 def without_dropouts(trial: Trial) -> Trial:
-    """The trial with forces missing where a finger's are nothing for one sample in the midst of a grip.
+    """Mark forces as missing where a finger reads nothing for a single sample within a grip.
 
-    No finger can let go and grip again from one sample to the next: the reading was lost. What the other
-    finger reads at that sample is as wrong where a simulator lost the contact.
+    No finger can let go and grip again within one sample: the reading was lost. If a simulator lost the
+    contact, the other finger's reading is wrong too.
     """
     force = np.stack([trial.channels[c] for c in FORCE_CHANNELS], 1).reshape(-1, 2, 2)
     size, pressed = np.abs(force).max(axis=2), np.stack([force[:, 0, 0], -force[:, 1, 0]], 1)
@@ -133,10 +137,13 @@ def without_dropouts(trial: Trial) -> Trial:
 
 
 def thinned(trial: Trial, rig: Rig, rate: float = MAX_RATE) -> tuple[Trial, int]:
-    """The trial averaged down to a `rate` [Hz] at most, and how many samples went into one.
+    """Average a trial down to a `rate` [Hz] at most.
 
-    Lost readings are left out. Angles and their rates are those of the tips' mean positions and velocities:
-    a finger that moves quickly is not where its mean angles are.
+    Lost readings are left out. Angles and rates are those of the tips' mean positions and velocities, as a
+    fast finger is not where its mean angles are.
+
+    Returns:
+        The trial, and the number of samples averaged into one.
     """
     trial = without_dropouts(trial)
     group = group_size(trial.rate, rate)
@@ -154,7 +161,7 @@ def thinned(trial: Trial, rig: Rig, rate: float = MAX_RATE) -> tuple[Trial, int]
 def _of_mean_tip(
     trial: Trial, means: dict[str, np.ndarray], finger: Finger, number: int, group: int
 ) -> dict[str, np.ndarray]:
-    """Angles and rates of one finger at its tip's mean position and velocity, from their own `means`."""
+    """Angles and rates of one finger at its tip's mean position and velocity, linearised at their `means`."""
     names = [f"q{number}{k}" for k in (1, 2)]
     rates = [f"d{name}" for name in names]
 
@@ -170,7 +177,7 @@ def _of_mean_tip(
 
 
 def boundary_quantiles(aligned: TrialAlignment) -> np.ndarray:
-    """Quantiles (3, B) [s] of every boundary: nearly the first, the median and nearly the last it may be."""
+    """Quantiles (3, B) [s] of every boundary: EITHER_SIDE, the median, and 1 - EITHER_SIDE."""
     levels = (EITHER_SIDE, 0.5, 1 - EITHER_SIDE)
     return np.array([[b.quantile(p) for b in aligned.boundaries] for p in levels])
 
@@ -178,7 +185,7 @@ def boundary_quantiles(aligned: TrialAlignment) -> np.ndarray:
 def trial_arrays(
     trial: Trial, quantiles: np.ndarray, steps: tuple[Subtask, ...], rig: Rig
 ) -> dict[str, np.ndarray]:
-    """One trial's signals, states and noise, arrays over its samples."""
+    """One trial's signals, states and noise as arrays over its samples."""
     trial, group = thinned(trial, rig)
     first, boundaries, last = quantiles
     signals = task_space(trial, rig)
@@ -198,7 +205,8 @@ def trial_arrays(
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
-    push = pushed(mean_of(signals, "x"), sample["x"] / np.sqrt(2))
+    # The finger that touches first pushes the block for a while, and so does a closing hand.
+    push = changes(mean_of(signals, "x"), sample["x"] / np.sqrt(2))
     sd = np.hypot(plain, motion_doubt(signals, sample, push, step, group, rig.fingertip))
     sd[:, FORCES] = np.hypot(sd[:, FORCES], between_samples(t, force, free, edge & carry, boundaries))
     shaken = _shaken(signals, sample, force, carry, subtask, step, group) / rig.gravity
@@ -212,10 +220,10 @@ def trial_arrays(
     there[lone, FORCES] = 0.0
     there[_opening(signals, force, free), GRIP_FORCE] = 0.0
     carried = np.array([phase_of(s) == Phase.CARRY for s in steps])
-    lifts = carried[1:] != carried[:-1]  # a block leaves its support or meets one
+    lifts = carried[1:] != carried[:-1]  # a block leaves or meets a support
     either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
     there[np.ix_(either, np.isin(CHANNELS, BORNE))] = 0.0
-    if group > 1:  # a mean over a contact change is of neither contact
+    if group > 1:  # a mean over a contact change belongs to neither contact
         there[np.abs(t[:, None] - boundaries).min(axis=1) <= step / 2] = 0.0
     return {
         "t": t,
@@ -228,16 +236,16 @@ def trial_arrays(
         "plain": plain,
         "pushed": push,
         "sensor": sensor_sd(joints, rates, sample, rig, group),
-        "sample": channel_noise(sample) * np.sqrt(group),  # of one as it was recorded
-        "kind": (2 * phase + edge).astype(float),
-        "subtask": subtask.astype(float),
-        "move": _moves(t, boundaries, steps, subtask).astype(float),
+        "sample": channel_noise(sample) * np.sqrt(group),  # of one recorded sample
+        "kind": 2 * phase + edge,
+        "subtask": subtask,
+        "move": _moves(t, boundaries, steps, subtask),
         "phase": np.eye(len(Phase))[phase],
     }
 
 
 def _struck(force: np.ndarray, sd: np.ndarray) -> np.ndarray:
-    """Samples (N,) next to a finger's touch or release, where its speed jumps as no difference shows."""
+    """Samples (N,) next to a finger's touch or release, where its speed jumps unseen by any difference."""
     touches = np.hypot(force[:, ::2], force[:, 1::2]) > SURE * sd[:, None]
     change = np.pad((touches[1:] != touches[:-1]).any(axis=1), (2, 2))
     return change[:-3] | change[1:-2] | change[2:-1] | change[3:]
@@ -247,14 +255,14 @@ def _shaken(
     signals: Signals, sample: dict[str, np.ndarray], force: np.ndarray, carried: np.ndarray,
     subtask: np.ndarray, step: float, group: int,
 ) -> np.ndarray:  # fmt: skip
-    """By how much (N,) a carried block's load jumps near each sample, times gravity."""
+    """Jump (N,) of a carried block's load near each sample, times gravity."""
     weight, root2 = np.zeros(carried.size), np.sqrt(2.0)
     for s in np.unique(subtask[carried]):
         mine = subtask == s
         weight[mine] = max(float(np.median(force[mine, 1] + force[mine, 3])), 0.0)
     jumps = np.hypot(*(kinks(mean_of(signals, v), sample[v] / root2) for v in ("vx", "vy")))
-    # Differences of speeds have one or the other next to a jump, and what pads hold rings as much again, both
-    # ways, for it turns in the grip as well.
+    # Differences of velocities see one side or the other of a jump, and what pads hold rings as much again in
+    # both directions, as it turns in the grip as well.
     return weight * root2 * of_a_kink(group)[1] / step * jumps
 
 
@@ -266,11 +274,11 @@ def _one_finger(
     boundaries: np.ndarray,
     sd: np.ndarray,
 ) -> np.ndarray:
-    """Samples (N,) of free motion next to a grip at which one finger touches already or still.
+    """Samples (N,) of free motion next to a grip at which only one finger touches.
 
-    Such a touch, of the block or of what stands below it, is a contact that the task does not list and no
-    gap. One finger's force is off its own median in that free motion, the other's is not; `sd` (N,) is a
-    force's noise [N].
+    Such a touch, of the block or of its support, is a contact that the task does not list, and no gap. One
+    finger's force departs from its median in that free motion, the other's does not; `sd` (N,) is the noise
+    of a force [N].
     """
     out = np.zeros(t.size, bool)
     for s in np.unique(subtask[free]):
@@ -283,11 +291,11 @@ def _one_finger(
 
 
 def _opening(signals: Signals, force: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Samples (N,) right after a grip at which fingers are not yet as far apart as pads without load are.
+    """Samples (N,) right after a grip at which the fingers are closer than unloaded pads would be.
 
-    Pads come back late: fingers that open lose the block while they are still nearer than it is wide. How far
-    apart unloaded pads are is what the grip's own distances tend to as its force does to nothing, whatever
-    the pads' stiffness.
+    Pads recover late: opening fingers lose the block while they are still closer than it is wide. The
+    distance of unloaded pads is what the grip's own distances extrapolate to at zero force, whatever the
+    pads' stiffness.
     """
     out, distance, squeeze = np.zeros(free.size, bool), signals.x2 - signals.x1, force[:, 0] - force[:, 2]
     for end in np.flatnonzero(free[1:] & ~free[:-1]) + 1:
@@ -304,7 +312,7 @@ def _opening(signals: Signals, force: np.ndarray, free: np.ndarray) -> np.ndarra
 def _moves(
     t: np.ndarray, boundaries: np.ndarray, steps: tuple[Subtask, ...], subtask: np.ndarray
 ) -> np.ndarray:
-    """The move of each sample; free motion belongs to the nearer grip."""
+    """Move of each sample; free motion belongs to the nearer grip."""
     own = [-1 if s.state == FREE or s.move is None else s.move for s in steps]
     starts, ends = {}, {}
     for k, move in enumerate(own):
@@ -324,7 +332,7 @@ def _filled(t: np.ndarray, values: np.ndarray) -> np.ndarray:
 def _there(
     t: np.ndarray, phase: np.ndarray, force: np.ndarray, place: np.ndarray, speed: np.ndarray
 ) -> np.ndarray:
-    """Where each channel's equation is defined and every signal in it was recorded (N, C)."""
+    """Where each channel's equation holds and all of its signals were recorded (N, C)."""
     free, carry = phase == Phase.FREE, phase == Phase.CARRY
     held, still = ~free, (phase == Phase.PICKUP) | (phase == Phase.PLACE)
     step = np.diff(t)
@@ -353,13 +361,19 @@ def _there(
 class Arrays(NamedTuple):
     """Constants of the contact equations: T trials, N samples, C channels, M moves, O objects.
 
-    `there` (T, N, C): 1 where a residual is defined and recorded; `sd` (T, N, C): how far it
-    is off by sensors and in doubt, in units of the channel, `plain` by sensors alone; `pushed` (T, N) [m]:
-    how far the fingers are seen to go from sample to sample; `kind` (T, N):
-    2 * phase, + 1 next to a contact change; `subtask` (T, N);
-    `onehot` (T, N, M): nearest move; `new` (T, N, 3): first samples with another constant of x, y, offset;
-    `objects`, `rises` (M, O); `phase` (T, N, 5) one-hot; `sample` (T, N, C): noise of one sample of a channel
-    itself; `sensor` (T, N, 3): that of angles, rates and forces as they are in `World`.
+    Attributes:
+        there: 1 (T, N, C) where a residual is defined and recorded.
+        sd: Standard deviation (T, N, C) of residuals from sensors and doubts, in units of the channel.
+        plain: That from sensors alone (T, N, C).
+        pushed: Motion of the fingers (T, N) from sample to sample beyond noise [m].
+        kind: 2 * phase (T, N), + 1 next to a contact change.
+        subtask: Index of the subtask (T, N).
+        onehot: Nearest move (T, N, M), one-hot.
+        new: First samples (T, N, 3) with a new constant of x, y, offset.
+        objects, rises: Block (M, O) of each move, and the heights that raise its destination.
+        phase: Phase (T, N, 5), one-hot.
+        sample: Noise (T, N, C) of a single sample of each channel itself.
+        sensor: Noise (T, N, 3) of angles, rates and forces as in `World`.
     """
 
     there: np.ndarray
@@ -379,9 +393,17 @@ class Arrays(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """Everything the diagnosis needs of aligned trials.
+    """Aligned trials as the diagnosis needs them.
 
-    `forces`: each trial's forces (N, 4) [N] as they were read, of which `groups` became one sample here.
+    Attributes:
+        files: Names of the trials.
+        steps: Subtasks of the task.
+        task, rig: The task and the nominal hand.
+        world: Signals, states and constants that effects change.
+        arrays: Constants of the contact equations.
+        lengths: Number of samples of each trial, padding left out.
+        forces: Each trial's forces (N, 4) as recorded [N].
+        groups: Number of recorded samples averaged into one.
     """
 
     files: tuple[str, ...]
@@ -396,12 +418,16 @@ class Frame:
 
     @property
     def num_trials(self) -> int:
-        """Number of real trials."""
+        """Number of trials."""
         return len(self.files)
 
 
 def build(aligned: AlignedTrials) -> Frame:
-    """Frame of the trials that fit their task; ValueError where none does."""
+    """Assemble the frame of the trials that fit their task.
+
+    Raises:
+        ValueError: No trial fits its task.
+    """
     steps, task, rig = aligned.subtasks, aligned.task, aligned.rig
     chosen = [a for a in aligned.trials if a.segmentation.complete]
     if not chosen:
@@ -413,8 +439,8 @@ def build(aligned: AlignedTrials) -> Frame:
     events = np.stack([r["events"] for r in rows])
     for r, row in enumerate(rows):
         end, t = row["t"].size, stack["t"][r]
-        stack["there"][r, end:] = 0.0  # padding says nothing
-        # Time continues evenly, as the sampling interval is read off it.
+        stack["there"][r, end:] = 0.0  # padding
+        # Time continues evenly, as the sampling interval is computed from it.
         t[end:] = t[end - 1] + np.median(np.diff(t[:end])) * np.arange(1, length - end + 1)
     moves = len(task.performed)
     objects, rises = np.zeros((moves, len(task.objects))), np.zeros((moves, len(task.objects)))
@@ -423,23 +449,11 @@ def build(aligned: AlignedTrials) -> Frame:
     for m, rise in height_equations(task):
         for name, value in rise.items():
             rises[m, task.objects.index(name)] = value
-    move, place = stack["move"].astype(int), stack["phase"][..., Phase.PLACE].astype(int)
+    move, place = stack["move"], stack["phase"][..., Phase.PLACE].astype(int)
     grip, part = _others(move), _others(2 * move + place)
-    arrays = Arrays(
-        stack["there"],
-        stack["sd"],
-        stack["plain"],
-        stack["pushed"],
-        stack["kind"].astype(int),
-        stack["subtask"].astype(int),
-        np.eye(moves)[move],
-        np.stack([part, grip, grip], -1),
-        objects,
-        rises,
-        stack["phase"],
-        stack["sample"],
-        stack["sensor"],
-    )
+    new = np.stack([part, grip, grip], -1)
+    own = {name: values for name, values in stack.items() if name in Arrays._fields}
+    arrays = Arrays(onehot=np.eye(moves)[move], new=new, objects=objects, rises=rises, **own)
     lengths = tuple(r["t"].size for r in rows)
     return Frame(
         tuple(t.name for t in trials),
@@ -455,12 +469,12 @@ def build(aligned: AlignedTrials) -> Frame:
 
 
 def _others(number: np.ndarray) -> np.ndarray:
-    """Samples (T, N) with another number than the one before."""
+    """Samples (T, N) whose number differs from that of the sample before."""
     return np.diff(number, axis=1, prepend=-1) != 0
 
 
 def _stacked(rows: list[np.ndarray], length: int) -> np.ndarray:
-    """Rows of different length as one array (T, length, ...), padded with their last entries."""
+    """Stack rows of different length as one array (T, length, ...), padded with their last entries."""
     return np.stack([np.pad(r, [(0, length - len(r)), *[(0, 0)] * (r.ndim - 1)], "edge") for r in rows])
 
 

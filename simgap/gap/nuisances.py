@@ -1,7 +1,7 @@
-"""What recordings contain that is not a fault, as columns fitted together with every effect.
+"""Features of recordings that are no fault, as columns fitted together with every effect.
 
-What rig.toml admits under [systematic]; speeds that a drive takes as differences; and blocks that turn in the
-grip. Each column is per its standard deviation beforehand, so that its prior is N(0, 1).
+They are what rig.toml admits under [systematic], velocities that a drive computes as differences, and blocks
+that turn in the grip. Each column is in units of its prior standard deviation, so that its prior is N(0, 1).
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from simgap.gap.frame import CHANNELS
 from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, residual_of, slots
 from simgap.phases import Phase
 
-PAD = 5e-3  # prior: m; half a pad's length: how hard it turns follows from that and its stiffness
-STANCES = (0.6, 1.0)  # prior: shares of a block's width between its feet; what lies between is a mixture
-SWING = 2e-3  # prior: rad; sd of the angle at which a lifted block hangs against how it stood
-LANDING = 4e-5  # prior: m; sd of how far a pad slides in the shock of landing
-BEYOND = 5e-3  # prior: kg; sd of a pad's mass in front of its sensor, whose weight was tared away
+PAD = 5e-3  # prior: m; half a pad's length, which with its stiffness determines how easily it turns
+STANCES = (0.6, 1.0)  # prior: distance between a block's feet over its width; values between are a mixture
+SWING = 2e-3  # prior: rad; sd of the angle of a lifted block relative to how it stood
+LANDING = 4e-5  # prior: m; sd of a pad's slip in the shock of landing
+BEYOND = 5e-3  # prior: kg; sd of a pad's mass in front of its sensor, whose weight was tared
 
 
 def with_nuisances(given: Problem) -> Problem:
-    """The problem with its nuisances, linear about no effect at all.
+    """Add the nuisances, linearised without effects.
 
-    How many there are depends on trials, grips and rig alone: a column of zeros stays, for with a little more
-    noise on the recordings it is none (`simgap.gap.assemble`).
+    Their number depends only on trials, grips and rig. A column of zeros is kept, as with additional noise on
+    the recordings it may not be zero (`simgap.gap.assemble`).
     """
     columns = [
         *_admitted(given), *_inertial(given), *_late_rates(given), *_turning(given), *_settling(given)
@@ -35,23 +35,26 @@ def with_nuisances(given: Problem) -> Problem:
 
 
 def _admitted(given: Problem) -> list[np.ndarray]:
-    """Columns (n, .) of what rig.toml admits under [systematic], each per its standard deviation."""
+    """Columns (n, .) of what rig.toml admits under [systematic]."""
     out, k = [], given.num_properties
     for slot in slots(k)[0]:
         if slot.effect.admitted is None:
             continue
         key, sds = slot.effect.admitted(given.frame.rig)
         if any(sds.values()):
-            push = derivatives(given, (key,), neutral(given))[:, k:]
+            jacobian = derivatives(given, (key,), neutral(given))[:, k:]
             for j, p in enumerate(free_of(key)):
                 if sds.get(p.name, 0.0) > 0:
-                    out.append(-push[:, [j]] * sds[p.name] / p.sd)
+                    out.append(-jacobian[:, [j]] * sds[p.name] / p.sd)
     return out
 
 
 def _inertial(given: Problem) -> list[np.ndarray]:
-    """The column (n, 1) of pads' inertia: a sensor that was tared with its pad on does not show the pad's
-    weight, but what it takes to accelerate it. No effect of the catalogue is that, and no fault."""
+    """The column (n, 1) of pads' inertia.
+
+    A sensor tared with its pad on does not show the pad's weight but the force that accelerates it. No effect
+    of the catalogue is that, and it is no fault.
+    """
     world = given.frame.world
     force = BEYOND * gradient(world.t, tips(world)[1])
     change = residual_of(given, with_load(world, force)) - residual_of(given, world)
@@ -59,21 +62,21 @@ def _inertial(given: Problem) -> list[np.ndarray]:
 
 
 def _late_rates(given: Problem) -> list[np.ndarray]:
-    """Columns (n, 1) of speeds that are differences of positions, late by half a sample, or smoothed.
+    """Columns (n, 1) of velocities that are differences of positions, late by half a sample, or smoothed.
 
-    How a drive comes by its speeds rig.toml does not say: differences are as usual as a tachometer.
+    rig.toml does not say how a drive obtains velocities: differences are as usual as a tachometer.
     """
-    world, weight = given.frame.world, given.whitening.weight
+    world, weight = given.frame.world, given.weight
     step = float(np.median(np.diff(world.t[0])))
     velocity = tips(world)[1]
     mean = (velocity[..., :2] + velocity[..., 2:]) / 2
     position = tips(world)[0]
     place = (position[..., :2] + position[..., 2:]) / 2
-    # Of the quieter of both: a column that holds the residual's own noise would be fitted to smooth it.
+    # From the quieter of the two: a column with the residual's own noise would be fitted to smooth it.
     calm = _quieter(given, mean, gradient(world.t, place), step)
     rate = gradient(world.t, calm)
     bend = gradient(world.t, rate)
-    # What a drive that takes differences of its own readings from sample to sample would say.
+    # The velocity of a drive that differentiates its own readings from sample to sample.
     before = np.concatenate([world.joints[:, :1], world.joints[:, :-1]], 1)
     own = tips(world._replace(rates=(world.joints - before) / step))[1]
     own = (own[..., :2] + own[..., 2:]) / 2
@@ -85,12 +88,12 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
         for k, channel in enumerate(("vx", "vy")):
             c = CHANNELS.index(channel)
             column[..., c] = usual * change[..., k] * weight[..., c]
-        out.append(column[weight > 0][:, None])
+        out.append(column[given.there][:, None])
     return out
 
 
 def _quieter(given: Problem, speed: np.ndarray, difference: np.ndarray, step: float) -> np.ndarray:
-    """Speeds (T, N, 2) as they were read or as differences of positions, whichever has less noise."""
+    """Velocities (T, N, 2) as read or as differences of positions, whichever have less noise."""
     sample, out = given.frame.arrays.sample, speed.copy()
     for k, (place, rate) in enumerate((("x", "vx"), ("y", "vy"))):
         shaken = np.median(sample[..., CHANNELS.index(place)]) / step
@@ -100,16 +103,16 @@ def _quieter(given: Problem, speed: np.ndarray, difference: np.ndarray, step: fl
 
 
 def _turning(given: Problem) -> list[np.ndarray]:
-    """Columns (n, 1) of blocks that turn in the grip: the fingers' offset moves by its width times the angle.
+    """Columns (n, 1) of blocks that turn in the grip: the fingers' offset changes by width times angle.
 
-    Balance of moments about its middle: what both fingers' shears and the couple of grips at unequal heights
-    exert turns a block against the pads, as far as its support does not hold it upright. The support's load
-    acts within its feet, so it holds a moment up to the load times half its stance; beyond that the block
-    turns about a foot, and its middle rises. How easily pads turn is not a fault.
+    Balance of moments about the block's middle: the shears of both fingers and the couple of grips at unequal
+    heights turn a block against the pads unless its support holds it upright. The load of the support acts
+    within the feet, so it withstands a moment up to the load times half the stance; beyond that the block
+    tips about a foot and its middle rises. How easily pads turn is no fault.
     """
     world, arrays = given.frame.world, given.frame.arrays
     stiffness = 1 / np.maximum(world.give_normal.mean(), 1e-9)
-    compliance = 3 / (2 * stiffness * PAD**2)  # rad/(N m) of both pads: rows of springs along their length
+    compliance = 3 / (2 * stiffness * PAD**2)  # rad/(N m) of both pads as rows of springs
     weight, width = (
         np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, k]) for k in (0, 1)
     )
@@ -127,8 +130,11 @@ def _turning(given: Problem) -> list[np.ndarray]:
 
 
 def _settling(given: Problem) -> list[np.ndarray]:
-    """Columns (n, 1) of what a grip has of its own: the angle at which a lifted block hangs against how it
-    stood, and by how much pads have slid when it is set down, for landing is a shock."""
+    """Columns (n, 1) for each grip: the angle of the lifted block relative to how it stood, and the slip of
+    pads in
+
+    the shock of setting it down.
+    """
     arrays, out = given.frame.arrays, []
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
     for t in range(given.frame.num_trials):
@@ -142,7 +148,7 @@ def _settling(given: Problem) -> list[np.ndarray]:
 
 
 def _column(given: Problem, shifts: dict[str, np.ndarray]) -> np.ndarray:
-    """The whitened column (n, 1) of shifts (T, N) of x, y, distance or offset."""
+    """Whitened column (n, 1) of shifts (T, N) of x, y, distance or offset."""
     world, off = given.frame.world, np.zeros((*given.frame.world.t.shape, 4))
     for name, shift in shifts.items():
         off[..., CHANNELS.index(name)] = shift

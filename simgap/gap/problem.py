@@ -1,11 +1,11 @@
-"""The problem of fitting: a frame, its whitening, the properties' prior, and a column for every unknown."""
+"""The fitting problem: a frame, the noise of its residuals, priors, and the columns of all parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -19,51 +19,36 @@ from simgap.effects.base import HandEffect, World
 from simgap.gap.frame import CHANNELS, Frame
 from simgap.gap.residuals import contact, residuals
 
-# Residuals in units of their sensors' noise.
-
-
-class Whitening(NamedTuple):
-    """`weight` (T, N, C) of trials, samples, channels: 1 / standard deviation, 0 where there is nothing."""
-
-    weight: np.ndarray
-
-
-def whitening(frame: Frame) -> Whitening:
-    """The whitening of a frame's residuals."""
-    a = frame.arrays
-    return Whitening(np.where(a.there > 0, 1 / a.sd, 0.0))
-
-
 # Linear unknowns with a normal prior, integrated out of a least-squares problem.
 
 
 @dataclass(frozen=True)
 class Nuisances:
-    """Columns (n, Z) of whitened residuals, each per its standard deviation beforehand."""
+    """Derivatives (n, Z) of whitened residuals by nuisances, in units of their prior standard deviations."""
 
     columns: np.ndarray
 
     @cached_property
     def _basis(self) -> tuple[np.ndarray, np.ndarray]:
-        """Orthonormal directions (n, R), and what share (R,) of a square along each they take away."""
-        bend = self.columns.T @ self.columns
-        square, turn = np.linalg.eigh(bend)
+        """Orthonormal directions (n, R), and the share (R,) of a square along each that nuisances explain."""
+        curvature = self.columns.T @ self.columns
+        square, turn = np.linalg.eigh(curvature)
         kept = square > 1e-9 * max(float(square.max(initial=0.0)), 1e-9)
         return self.columns @ (turn[:, kept] / np.sqrt(square[kept])), square[kept] / (1 + square[kept])
 
     def product(self, a: np.ndarray, b: np.ndarray) -> Any:
-        """a' (1 + columns columns')^-1 b of (n, ...) each: what nuisances may have made counts less."""
+        """a' (1 + columns columns')^-1 b of (n, ...) each: directions that nuisances explain count less."""
         basis, taken = self._basis
         mine, other = basis.T @ a, basis.T @ b
         return a.T @ b - (mine.T * taken) @ other
 
     def left(self, residual: np.ndarray) -> np.ndarray:
-        """What they leave of a residual (n,), each at its likeliest value."""
+        """The residual (n,) minus the likeliest nuisances."""
         basis, taken = self._basis
         return residual - basis @ (taken * (basis.T @ residual))
 
     def kept(self, rows: Rows, variance: np.ndarray) -> np.ndarray:
-        """What they leave of independent cosine coefficients with these variances (n,)."""
+        """Variances (n,) of independent cosine coefficients after the likeliest nuisances are subtracted."""
         mine, (basis, taken) = np.flatnonzero(variance > 0), self._basis
         few = cosines(rows, basis)[0][mine]
         out = np.zeros(variance.size)
@@ -71,21 +56,16 @@ class Nuisances:
         return out
 
 
-# prior: what measured weight (share), width, height [m] may be off in addition to their own sd
+# prior: error of measured weight (relative), width and height [m] in addition to the stated sd
 MEASURED = (2e-3, 3e-5, 4e-5)
 
 
 @dataclass(frozen=True)
 class Slot:
-    """One effect's place among the columns of all parameters."""
+    """One effect and its first column among those of all parameters."""
 
     effect: HandEffect
     start: int
-
-    @property
-    def stop(self) -> int:
-        """One past its last column."""
-        return self.start + len(self.effect.parameters)
 
 
 @lru_cache
@@ -101,18 +81,25 @@ def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
 
 @dataclass(frozen=True)
 class Problem:
-    """A frame with its whitening and the properties' prior: `centre`, `sd` (O, 3); which of weight, width
-    and height were `measured` (O, 3) apart; `nuisances` that every fit leaves free."""
+    """A frame and what its residuals are fitted with, for O blocks.
+
+    Attributes:
+        frame: Aligned trials.
+        weight: 1 / noise (T, N, C) of every residual; 0 where there is none.
+        centre, sd: Normal prior (O, 3) of weight [N], width and height [m].
+        measured: Which of these (O, 3) were measured apart from the trials.
+        nuisances: Columns that every fit leaves free.
+    """
 
     frame: Frame
-    whitening: Whitening
+    weight: np.ndarray
     centre: np.ndarray
     sd: np.ndarray
     measured: np.ndarray
     nuisances: Nuisances
 
     def product(self, a: np.ndarray, b: np.ndarray) -> Any:
-        """Products of residuals, or of their derivatives, (n, ...), nuisances integrated out."""
+        """Products of residuals or of their derivatives (n, ...), nuisances integrated out."""
         return self.nuisances.product(a, b) if self.nuisances.columns.size else a.T @ b
 
     def properties(self, u: np.ndarray) -> np.ndarray:
@@ -121,14 +108,14 @@ class Problem:
         return self.centre + self.sd * own.reshape(*own.shape[:-1], *self.centre.shape)
 
     @cached_property
-    def noise(self) -> np.ndarray:
-        """Standard deviation (T, N, C) of every residual, 1 where there is none."""
-        return 1 / np.where(self.whitening.weight > 0, self.whitening.weight, 1.0)
+    def there(self) -> np.ndarray:
+        """Mask (T, N, C) of the n residuals that exist; vectors of residuals (n,) are in its order."""
+        return self.weight > 0
 
     @cached_property
-    def existing(self) -> np.ndarray:
-        """Places (n,) of the residuals among all (T, N, C), in one row."""
-        return np.flatnonzero(self.whitening.weight > 0)
+    def noise(self) -> np.ndarray:
+        """Standard deviation (T, N, C) of every residual, 1 where there is none."""
+        return 1 / np.where(self.there, self.weight, 1.0)
 
     @property
     def num_properties(self) -> int:
@@ -138,16 +125,21 @@ class Problem:
     @property
     def size(self) -> int:
         """Number of residuals."""
-        return self.existing.size
+        return int(self.there.sum())
 
 
 def problem(
     frame: Frame, actual: dict | None = None, identified: Mapping[tuple[str, str], float] | None = None
 ) -> Problem:
-    """The problem of a frame; `actual` as `estimation.report` reads it narrows the prior.
+    """Set up the problem of a frame, without nuisances.
 
-    The prior is identification's (log-normal, `estimation.priors`), linearised about what was `identified`
-    (block, property) [N, m], else about its median: in here properties are departures from those.
+    The prior is that of identification (log-normal, `estimation.priors`), linearised about the identified
+    values, else about its median; departures from these are fitted.
+
+    Args:
+        frame: Aligned trials.
+        actual: Measured properties as read by `estimation.report`; they narrow the prior.
+        identified: Property values by block and property [N, m].
     """
     objects = frame.task.objects
     centre, sd = np.zeros((len(objects), 3)), np.zeros((len(objects), 3))
@@ -171,18 +163,18 @@ def rebased(frame: Frame, given: Problem) -> Problem:
 
 
 def _bare(frame: Frame, centre: np.ndarray, sd: np.ndarray, measured: np.ndarray) -> Problem:
-    white = whitening(frame)
-    none = Nuisances(np.zeros((int((white.weight > 0).sum()), 0)))
-    return Problem(frame, white, centre, sd, measured, none)
+    weight = np.where(frame.arrays.there > 0, 1 / frame.arrays.sd, 0.0)
+    none = Nuisances(np.zeros((int((weight > 0).sum()), 0)))
+    return Problem(frame, weight, centre, sd, measured, none)
 
 
 def free_of(key: str) -> list[Parameter]:
-    """The free parameters of an effect's form, in the order of its columns."""
+    """Free parameters of an effect's form, in the order of its columns."""
     return [p for p in catalogue()[name_of(key)].parameters.values() if p.name in free_parameters(key)]
 
 
 def neutral(given: Problem) -> np.ndarray:
-    """Coordinates of no effect at all: properties at the centre of their prior."""
+    """Coordinates of no effect, with properties at the centre of their prior."""
     places, total = slots(given.num_properties)
     u = np.zeros(total)
     for slot in places:
@@ -193,7 +185,7 @@ def neutral(given: Problem) -> np.ndarray:
 
 
 def columns_of(given: Problem, effects: Sequence[str]) -> np.ndarray:
-    """Columns of the properties and of the parameters that effects' forms have free."""
+    """Columns of the properties and of the free parameters of effects' forms."""
     out = [np.arange(given.num_properties)]
     places = {s.effect.name: s for s in slots(given.num_properties)[0]}
     for key in effects:
@@ -212,49 +204,50 @@ def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-# The smallest gap that matters: what rig.toml says under [tolerance], or what its sensors could not show.
+# The smallest gap that matters: [tolerance] of rig.toml, or what its sensors could not show.
 
-SAMPLES = 0.5  # chosen: sds of one sample: a shift below that is not seen in any single one
-PROPERTY = 0.01  # chosen: the same, of a property
-SHARE = 0.005  # cited: of a block's width or weight: the better half of the paper's own errors (its Table 4)
+SAMPLES = 0.5  # chosen: sds of one sample: a smaller shift is invisible in any single sample
+PROPERTY = 0.01  # chosen: relative error of a property that does not matter
+# cited: share of a block's width or weight: the better half of the paper's own errors (its Table 4)
+SHARE = 0.005
 
 
 def properties_tolerated(given: Problem) -> np.ndarray:
-    """By how much properties (3 O,) may be off before it matters, in sds of their prior."""
+    """Largest errors of properties (3 O,) that do not matter, in standard deviations of their prior."""
     share = given.frame.rig.tolerance.property or PROPERTY
     return (share * np.abs(given.centre) / given.sd).ravel()
 
 
 def tolerated(given: Problem) -> np.ndarray:
-    """The smallest shift (n,) of each residual that matters, in sds of its noise.
+    """Smallest shift (n,) of each residual that matters, in standard deviations of its noise.
 
-    Positions and forces as [tolerance] has them; by default one sample's noise or SHARE of the smallest
-    block's width and weight, whichever is more. Velocities matter as much as a sample's noise.
+    Positions and forces as stated in [tolerance]; by default one sample's noise or SHARE of the smallest
+    block's width and weight, whichever is larger. Velocities matter from one sample's noise on.
     """
-    frame, there = given.frame, given.whitening.weight > 0
+    frame = given.frame
     stated = frame.rig.tolerance
     width, weight = (float(np.abs(given.centre[:, k]).min()) for k in (1, 0))
     noise = frame.arrays.sample
-    out = np.empty_like(given.whitening.weight)
+    out = np.empty_like(given.weight)
     for c, name in enumerate(CHANNELS):
         least = SAMPLES * noise[..., c]
         if name in ("x", "y", "distance", "offset"):
             least = stated.position or np.maximum(least, SHARE * width)
         elif name in ("fx", "fy", "grip", "shear"):
             least = stated.force or np.maximum(least, SHARE * weight)
-        out[..., c] = least * given.whitening.weight[..., c]
-    return out[there]
+        out[..., c] = least * given.weight[..., c]
+    return out[given.there]
 
 
-# What a candidate leaves: the contact equations' residuals with its effects taken out, and derivatives.
+# Residuals of a candidate: those of the contact equations after its effects are corrected, with derivatives.
 
-STEP = 1e-5  # numerics: of a usual deviation, for differences
+STEP = 1e-5  # numerics: step of finite differences, in prior standard deviations
 
 
-def corrected(world: World, u: np.ndarray, effects: Sequence[str], num_properties: int) -> World:
-    """The world with these effects, at coordinates u (all columns), taken out."""
-    names = {name_of(key) for key in effects}
-    for slot in slots(num_properties)[0]:
+def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
+    """The recorded world corrected for effects at coordinates u (all columns)."""
+    world, names = given.frame.world, {name_of(key) for key in effects}
+    for slot in slots(given.num_properties)[0]:
         if slot.effect.name in names:
             each = enumerate(slot.effect.parameters.values())
             values = {p.name: p.value(u[slot.start + j]) for j, p in each}
@@ -263,15 +256,18 @@ def corrected(world: World, u: np.ndarray, effects: Sequence[str], num_propertie
 
 
 def whitened(given: Problem, world: World, properties: np.ndarray) -> tuple[np.ndarray, float]:
-    """Whitened residuals (T, N, C) of a world that effects were taken out of, and the cost of doubts [nats].
+    """Whitened residuals (T, N, C) of a corrected world, and the cost of doubts [nats].
 
-    A residual in doubt counts for less; half the log of its variance's factor is what that costs.
-    `properties` (O, 3): weight, width, height.
+    A residual in doubt has a larger variance; half the log of this factor is its cost.
+
+    Args:
+        given: The problem.
+        world: The world, corrected for effects.
+        properties: Weight, width and height (O, 3).
     """
-    weight = given.whitening.weight
     raw, factor, unseen = residuals(world, given.frame.arrays, properties, given.noise)
-    cost = unseen + 0.5 * float(np.log(factor[weight > 0]).sum())
-    return raw / np.sqrt(factor) * weight, cost
+    cost = unseen + 0.5 * float(np.log(factor[given.there]).sum())
+    return raw / np.sqrt(factor) * given.weight, cost
 
 
 def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
@@ -280,43 +276,57 @@ def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.nda
 
 
 def residual_of(given: Problem, world: World) -> np.ndarray:
-    """Whitened residuals (n,) of a world that effects were taken out of, properties as expected."""
-    return whitened(given, world, given.properties(neutral(given)))[0].ravel()[given.existing]
+    """Whitened residuals (n,) of a corrected world, with properties at the centre of their prior."""
+    return whitened(given, world, given.properties(neutral(given)))[0][given.there]
 
 
 def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
-    """The recorded world with the effects at coordinates u taken out of it, late forces in time again."""
+    """The recorded world corrected for effects at coordinates u, with late forces back in time."""
     world = _without_effects(given, effects, u)
     return world._replace(force=contact(world), load=np.zeros_like(world.load))
 
 
 def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
-    """Residuals (T, N, C) in units of their channels."""
+    """Residuals (T, N, C) of a candidate in units of their channels."""
     world = _without_effects(given, effects, u)
     return residuals(world, given.frame.arrays, given.properties(u), given.noise)[0]
 
 
-def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
-    return corrected(given.frame.world, u, effects, given.num_properties)
+@dataclass(frozen=True)
+class Fitted:
+    """A candidate, evaluated at coordinates that are usually those of its best fit.
 
+    Attributes:
+        effects: Keys of its effects' forms.
+        u: Coordinates of all parameters.
+        columns: Those of them (K,) that are free.
+        residual: Whitened residuals (n,).
+        jacobian: Their derivatives (n, K) with respect to the free coordinates.
+        doubts: Cost of residuals in doubt [nats].
+        doubt_slope: Its derivatives (K,).
+        cost: Doubts, half the squared residuals with nuisances integrated out, and the prior [nats].
+    """
 
-class Evaluated(NamedTuple):
-    """A candidate at some coordinates: its residual (n,), the cost of doubts [nats], both one's derivatives
-    `push` (n, K) and `lift` (K,), and the cost."""
-
+    effects: tuple[str, ...]
+    u: np.ndarray
+    columns: np.ndarray
     residual: np.ndarray
+    jacobian: np.ndarray
     doubts: float
-    push: np.ndarray
-    lift: np.ndarray
+    doubt_slope: np.ndarray
     cost: float
 
 
 def cost_at(
-    given: Problem, effects: tuple[str, ...], u: np.ndarray, mine: np.ndarray, blocks: list[np.ndarray]
-) -> tuple[np.ndarray, float, float]:
-    """What a candidate leaves (n,) at coordinates u, the cost of doubts [nats], and the cost in all."""
+    given: Problem, effects: tuple[str, ...], u: np.ndarray, mine: np.ndarray,
+    blocks: Sequence[np.ndarray] = (),
+) -> tuple[np.ndarray, float, float]:  # fmt: skip
+    """Whitened residuals (n,) of a candidate at coordinates u, the cost of doubts, and the total cost [nats].
+
+    Properties at the columns `mine` have normal priors, each of the `blocks` of them a Cauchy distribution.
+    """
     left, doubts = whitened(given, _without_effects(given, effects, u), given.properties(u))
-    left, own = left.ravel()[given.existing], u[mine[: given.num_properties]]
+    left, own = left[given.there], u[mine[: given.num_properties]]
     cost = 0.5 * float(given.product(left, left)) + doubts + 0.5 * float(own @ own)
     for block in blocks:
         x = u[mine[block]]
@@ -329,100 +339,90 @@ def evaluated(
     effects: tuple[str, ...],
     u: np.ndarray,
     mine: np.ndarray,
-    at: tuple[np.ndarray, float, float],
     usual: np.ndarray | None = None,
-) -> Evaluated:
-    """What a candidate leaves at coordinates u, as `cost_at` has it, and its derivatives by columns `mine`.
+    at: tuple[np.ndarray, float, float] | None = None,
+) -> Fitted:
+    """Evaluate a candidate and its derivatives by forward differences.
 
-    They are differences over a small step: in double precision good to STEP of a usual deviation. `usual`
-    (n, P): those by the properties, which an effect hardly changes, where they are known already.
+    Args:
+        given: The problem.
+        effects: Keys of the candidate's effects.
+        u: Coordinates of all parameters.
+        mine: Columns (K,) to differentiate with respect to, all properties first.
+        usual: Known derivatives (n, P) with respect to the properties, which an effect hardly changes.
+        at: Result of `cost_at`, if known.
     """
+    at = cost_at(given, effects, u, mine) if at is None else at
     k, step, properties, each = given.num_properties, u.copy(), given.properties(u), []
-    if usual is None:  # a property alone needs no effect taken out once more
+    if usual is None:  # properties need no further correction
         world = _without_effects(given, effects, u)
         each += [whitened(given, world, row) for row in given.properties(u + STEP * np.eye(k, u.size))]
     for column in mine[k:]:
         step[column] += STEP
         each.append(whitened(given, _without_effects(given, effects, step), properties))
         step[column] = u[column]
-    z = np.array([residual.ravel()[given.existing] for residual, _ in each]).reshape(len(each), given.size)
-    push, lift = (z - at[0]).T / STEP, (np.array([doubt for _, doubt in each]) - at[1]) / STEP
+    z = np.array([residual[given.there] for residual, _ in each]).reshape(len(each), given.size)
+    jacobian, doubt_slope = (z - at[0]).T / STEP, (np.array([doubt for _, doubt in each]) - at[1]) / STEP
     if usual is not None:
-        push = np.concatenate([usual, push], 1)
-        lift = np.concatenate([np.zeros(k), lift])
-    return Evaluated(*at[:2], push, lift, at[2])
+        jacobian = np.concatenate([usual, jacobian], 1)
+        doubt_slope = np.concatenate([np.zeros(k), doubt_slope])
+    return Fitted(effects, u, mine, at[0], jacobian, at[1], doubt_slope, at[2])
 
 
 def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
-    """Derivatives (n, K) of a candidate's n whitened residuals by its free columns, at coordinates u.
-
-    Residuals are those that exist, in the order of the mask `whitening.weight > 0`.
-    """
+    """Derivatives (n, K) of a candidate's whitened residuals by its free columns, at coordinates u."""
     effects, mine = tuple(effects), columns_of(given, effects)
-    return evaluated(given, effects, u, mine, cost_at(given, effects, u, mine, [])).push
+    return evaluated(given, effects, u, mine).jacobian
 
 
-# Properties and effects fitted together, by Levenberg-Marquardt steps within the limits of each.
+# Joint fits of properties and effects.
 
-STEPS = 12  # numerics: of an iteration, at most
+STEPS = 12  # numerics: most iterations
 CLOSE = 0.02  # numerics: nats
 
 
-@dataclass(frozen=True)
-class Start:
-    """A candidate's start: its effects and the coordinates (all columns) to start from."""
+def fit(
+    given: Problem,
+    effects: tuple[str, ...],
+    u: np.ndarray,
+    steps: int = STEPS,
+    usual: np.ndarray | None = None,
+) -> Fitted:
+    """Fit properties and effects by Levenberg-Marquardt steps within the limits of each coordinate.
 
-    effects: tuple[str, ...]
-    u: np.ndarray
+    Properties have normal priors, the parameters of an effect a joint Cauchy distribution.
 
-
-@dataclass(frozen=True)
-class Fitted:
-    """A fitted candidate: coordinates `u` (all columns), of which `columns` (K,) were free.
-
-    `residual` (n,): what it leaves, whitened, in the order of the mask `whitening.weight > 0`; `push` (n, K)
-    its derivatives; `doubts` [nats]: the cost of residuals in doubt; `cost`: these, half the squares with
-    nuisances integrated out, and the prior.
+    Args:
+        given: The problem.
+        effects: Keys of the effects to be fitted.
+        u: Coordinates of all parameters to start from.
+        steps: Most steps; with 0 the start is only evaluated.
+        usual: Known derivatives (n, P) with respect to the properties (`evaluated`).
     """
-
-    effects: tuple[str, ...]
-    u: np.ndarray
-    columns: np.ndarray
-    residual: np.ndarray
-    push: np.ndarray
-    doubts: float
-    cost: float
-
-
-def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | None = None) -> Fitted:
-    """A start fitted by Levenberg-Marquardt; coordinates stay within their limits.
-
-    Properties have normal priors, an effect's parameters together a Cauchy distribution. `usual`: derivatives
-    by the properties, if `evaluated` need not recompute them.
-    """
-    mine, z = columns_of(given, start.effects), given.num_properties
+    mine = columns_of(given, effects)
     low, high = (edge[mine] for edge in limits(given))
-    u = start.u.copy()
+    u = u.copy()
     u[mine] = np.clip(u[mine], low, high)
-    blocks, at = [], z
-    for key in start.effects:
+    blocks, at = [], given.num_properties
+    for key in effects:
         blocks.append(np.arange(at, at + len(free_parameters(key))))
         at += blocks[-1].size
-    here = cost_at(given, start.effects, u, mine, blocks)
-    now, damping = evaluated(given, start.effects, u, mine, here, usual), 1e-3
+    here = cost_at(given, effects, u, mine, blocks)
+    now, damping = evaluated(given, effects, u, mine, usual, here), 1e-3
     for _ in range(steps):
         prior = np.ones(mine.size)
         for block in blocks:
             x = u[mine[block]]
             prior[block] = (1 + block.size) / (1 + x @ x)
-        slope = given.product(now.push, now.residual) + now.lift + prior * u[mine]
-        bend = given.product(now.push, now.push) + np.diag(prior)
-        step, _ = least(bend + damping * np.diag(np.diag(bend)), -slope, low - u[mine], high - u[mine])
+        slope = given.product(now.jacobian, now.residual) + now.doubt_slope + prior * u[mine]
+        curvature = given.product(now.jacobian, now.jacobian) + np.diag(prior)
+        damped = curvature + damping * np.diag(np.diag(curvature))
+        step, _ = least(damped, -slope, low - u[mine], high - u[mine])
         trial = u.copy()
         trial[mine] = np.clip(u[mine] + step, low, high)
-        here = cost_at(given, start.effects, trial, mine, blocks)
+        here = cost_at(given, effects, trial, mine, blocks)
         if np.isfinite(here[2]) and here[2] < now.cost:
-            new = evaluated(given, start.effects, trial, mine, here, usual)
+            new = evaluated(given, effects, trial, mine, usual, here)
             gained, u, now, damping = now.cost - new.cost, trial, new, damping / 5
             if gained < CLOSE:
                 break
@@ -430,4 +430,4 @@ def fit(given: Problem, start: Start, steps: int = STEPS, usual: np.ndarray | No
             damping *= 8
             if damping > 1e3:
                 break
-    return Fitted(start.effects, u, mine, now.residual, now.push, now.doubts, now.cost)
+    return now

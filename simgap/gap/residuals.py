@@ -1,10 +1,9 @@
-"""The contact equations as residuals: what a recording violates once an effect is taken out of it.
+"""The contact equations as residuals: what a recording violates once an effect is corrected for.
 
-Every sample gives as many equations between its four positions and four forces as unknowns leave
-(docs/gap.md): in free motion all forces are zero; held, the fingers' distance and offset follow the
-pads' forces; on the ground the block rests; in the air its net force is mass times
-acceleration and weight. Velocities are checked against
-positions. None of them multiplies position noise by a stiffness.
+Every sample gives as many equations between its four positions and four forces as its unknowns leave
+(docs/gap.md): in free motion all forces are zero; in a grip, distance and offset of the fingers follow the
+pads' forces; on the ground the block rests; in the air its net force is mass times acceleration plus weight.
+Velocities are checked against positions. No equation multiplies the noise of a position by a stiffness.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ from simgap.effects.filters import faded, lowpass
 from simgap.gap.frame import CHANNELS, Arrays
 from simgap.phases import Phase
 
-# Forces between two samples: read at other times, their slopes, and by how much these are in doubt.
+# Forces between two samples: their interpolation, their slopes, and the uncertainty of both.
 
-BETWEEN = 0.3  # prior: of a bend, sd: a force read between samples
-CURVED = 0.5  # prior: of the difference of two ways to take a slope, sd: how far it may be off
-EVEN = 0.025  # chosen: N; changes from one sample to the next below this have no corner
-SHARP = 0.75  # chosen: by how much one side is flatter, as a share of both, beyond which a force has a corner
-EITHER = 0.6  # prior: of a force's change, sd: how a force between two samples goes from one to the other
+BETWEEN = 0.3  # prior: sd of a force between two samples, over its bend
+CURVED = 0.5  # prior: sd of a slope, over the difference of two estimates of it
+EVEN = 0.025  # chosen: N; smaller changes between samples have no corner
+SHARP = 0.75  # chosen: difference of the two sides over their sum, above which a force has a corner
+EITHER = 0.6  # prior: sd of a force between two samples, over its change
 
 
 def net_forces(force: np.ndarray) -> np.ndarray:
@@ -46,15 +45,16 @@ def net_forces(force: np.ndarray) -> np.ndarray:
 
 
 def sampling_interval(world: World) -> float:
-    """The usual time [s] from one sample to the next."""
+    """Median time between samples [s]."""
     return float(np.median(np.diff(world.t, axis=1)))
 
 
 def shifted(values: np.ndarray, steps: np.ndarray | float) -> np.ndarray:
-    """Values (T, N, C) read `steps` samples later (a number or (C,), a fraction allowed): cubic Catmull-Rom.
+    """Values (T, N, C) read `steps` samples later, by cubic Catmull-Rom interpolation.
 
-    Where they have a corner between two samples, as at a contact change, both sides go straight on to it:
-    before a contact there is no force yet. Sides that would not meet between the two are joined straight.
+    At a corner between two samples, such as a contact change, both sides are extrapolated linearly instead:
+    before a contact there is no force. Sides that would not meet between the samples are joined by a straight
+    line. `steps` is a number or (C,), fractions allowed.
     """
     p0, p1, p2, p3, s = _around(values, steps)
     cubic = ((-p0 + 3 * p1 - 3 * p2 + p3) * s + (2 * p0 - 5 * p1 + 4 * p2 - p3)) * s + (p2 - p0)
@@ -72,8 +72,9 @@ def shifted(values: np.ndarray, steps: np.ndarray | float) -> np.ndarray:
 
 
 def _around(values: np.ndarray, steps: np.ndarray | float) -> tuple[np.ndarray, ...]:
-    """Four neighbours of (T, N, C) read `steps` samples later, a number or (C,), and the fraction (C,)
-    between the middle two."""
+    """Four neighbours of values (T, N, C) read `steps` samples later, and the fraction (C,) between the
+    middle two.
+    """
     steps = np.broadcast_to(steps, values.shape[2:])
     whole, n = np.floor(steps).astype(int), values.shape[1]
     index = np.arange(n)[:, None] + whole
@@ -82,16 +83,17 @@ def _around(values: np.ndarray, steps: np.ndarray | float) -> tuple[np.ndarray, 
 
 
 def _sharp(left: np.ndarray, right: np.ndarray, even: float) -> np.ndarray:
-    """How surely (0 to 1) changes on both sides are those of a corner; both are alike below `even`.
+    """How surely (0 to 1) the changes on both sides are those of a corner; they are alike below `even`.
 
-    A force that rises and falls as fast has a crest there: at a corner one side is flatter than the other.
+    A force that rises and falls equally fast has a crest there: at a corner one side is flatter than the
+    other.
     """
     left, right = np.abs(left), np.abs(right)
     return expit((np.abs(left - right) / (left + right + even) - SHARP) / 0.08)
 
 
 def fivepoint(world: World, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rate of change (T, N, C) from five samples, exact to fourth order, and from three."""
+    """Rates of change (T, N, C) from five samples, accurate to fourth order, and from three."""
     near = gradient(world.t, values)
     far = (values[:, 4:] - values[:, :-4]) / np.maximum(world.t[:, 4:] - world.t[:, :-4], 1e-6)[..., None]
     far = np.concatenate([near[:, :2], far, near[:, -2:]], 1)
@@ -99,11 +101,11 @@ def fivepoint(world: World, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def slope(world: World, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rate of change (T, N, C) of forces from five samples, and by how much it is in doubt.
+    """Rate of change (T, N, C) of forces from five samples, and its uncertainty.
 
-    Three samples alone take sin(w) for w [rad a sample]: a low-pass would come out too slow. Where a force
+    Three samples alone give sin(w) for w [rad per sample]: a low-pass would appear too slow. Where a force
     bends too sharply for either, at a contact change, the flatter side counts (a minmod limiter: Sweby, SIAM
-    J. Numer. Anal. 21, 1984): before a contact there is no force yet.
+    J. Numer. Anal. 21, 1984): before a contact there is no force.
     """
     smooth, near = fivepoint(world, force)
     side = (force[:, 1:] - force[:, :-1]) / np.maximum(world.t[:, 1:] - world.t[:, :-1], 1e-6)[..., None]
@@ -117,7 +119,7 @@ def slope(world: World, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def sensed(world: World, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Net force, grip and shear (T, N, 4) behind each sensor's low-pass and delay, and their variance.
 
-    The low-pass is exact between samples for straight lines. The variance is that of what is read between
+    The low-pass is exact for forces that are linear between samples. The variance is that of readings between
     two samples: a contact may have changed before or after, for both fingers at once.
     """
 
@@ -130,7 +132,7 @@ def sensed(world: World, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         variance = variance + _unsure(each, world.smoothing, step)
         each = lowpass(each, world.smoothing, step)
     if world.modes[LATE]:
-        # Read (1 - ahead) of a sample after the later one.
+        # Read at 1 - ahead of a sample after the later one.
         _, old, new, _, ahead = _around(each, -world.delay / step)
         either = np.sqrt(ahead * (1 - ahead) + 1e-12) * EITHER * (new - old)
         each, variance = old + ahead * (new - old), variance + np.square(net_forces(either))
@@ -138,8 +140,10 @@ def sensed(world: World, force: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _unsure(values: np.ndarray, time: np.ndarray, step: float) -> np.ndarray:
-    """Variance (T, N, 4) of net force, grip and shear behind the low-pass of each finger's force (T, N, 4),
-    from what may have changed at any moment between two samples, for both fingers at once."""
+    """Variance (T, N, 4) of net force, grip and shear behind the low-pass of each finger's force (T, N, 4).
+
+    A change between two samples may have happened at any moment, for both fingers at once.
+    """
     ratio = step / np.maximum(time, 1e-4)
     share = (1 - np.exp(-2 * ratio)) / (2 * ratio) - np.square((1 - np.exp(-ratio)) / ratio)
     change = np.concatenate([np.zeros_like(values[:, :1]), values[:, 1:] - values[:, :-1]], 1)
@@ -148,13 +152,13 @@ def _unsure(values: np.ndarray, time: np.ndarray, step: float) -> np.ndarray:
 
 
 def doubt_between(world: World) -> np.ndarray:
-    """Variance (T, N, 4) [N^2] of forces before delay and low-pass, from how sharply they bend."""
+    """Variance (T, N, 4) [N^2] of forces before delay and low-pass, from their bends."""
     out = np.zeros_like(world.force)
     if world.modes[LATE]:
         p0, p1, p2, p3, share = _around(world.force, world.delay / sampling_interval(world))
         share = share * (1 - share)
         bend = np.maximum(np.abs(p2 - 2 * p1 + p0), np.abs(p3 - 2 * p2 + p1))
-        # A change that neither side continues may have come at any moment between the two samples.
+        # A change that continues on neither side may have happened at any moment between the two samples.
         jump = np.maximum(np.abs(p2 - p1) - np.maximum(np.abs(p1 - p0), np.abs(p3 - p2)), 0.0)
         out = np.square(BETWEEN * share * bend) + share * np.square(EITHER * jump)
     if world.modes[SMOOTH]:
@@ -162,13 +166,13 @@ def doubt_between(world: World) -> np.ndarray:
     return out
 
 
-# Mechanics with a memory: a mode that rings, a support that yields late, pads that creep.
+# Mechanics with memory: a ringing mode, a support that yields late, pads that creep.
 
 
 def sunk(world: World, load: np.ndarray) -> np.ndarray:
-    """How far (T, N) [m] the support yields to what it carries of a block's weight, with its delay.
+    """How far (T, N) [m] the support yields, with its delay, to the part of a block's weight that it carries.
 
-    Before a grip it has settled under the block; it carries nothing of one that is in the air.
+    Before a grip it has settled under the block; it carries nothing of a lifted one.
     """
     if not world.modes[YIELDING]:
         return world.give_support * load
@@ -184,14 +188,14 @@ def sunk(world: World, load: np.ndarray) -> np.ndarray:
 
 
 def driven(world: World, force: np.ndarray, back: bool) -> np.ndarray:
-    """Loads (T, N, C) with the mode that their changes ring; `back`: the loads that rang to these readings.
+    """Loads (T, N, C) with the oscillation of a mode that their changes excite.
 
-    The load goes straight from sample to sample: exact in between, a step at a time.
+    With `back` the loads behind such readings. Exact for loads that are linear between samples.
     """
     frequency, damping, drive = world.ring
-    # The mode as a complex number z: `keep` turns it by a step, `gain` is what a unit of load, put on evenly
-    # over that step, rings it to, so that z[k] = keep z[k-1] + gain (f[k] - f[k-1]); readings are
-    # f + drive Im z: a rational filter of loads, and its inverse.
+    # The mode is a complex number z: `keep` turns it by one step, and `gain` is the oscillation excited by a
+    # unit of load that rises evenly over that step, so that z[k] = keep z[k-1] + gain (f[k] - f[k-1]).
+    # Readings are f + drive Im z: a rational filter of loads, which has an inverse.
     rate = complex(-damping, np.sqrt(max(1 - damping**2, 1e-6))) * 2 * np.pi * frequency
     rate *= sampling_interval(world)
     keep = np.exp(rate)
@@ -204,24 +208,24 @@ def driven(world: World, force: np.ndarray, back: bool) -> np.ndarray:
 
 
 def relaxed(world: World, force: np.ndarray) -> np.ndarray:
-    """Forces (T, N, 4) that would give the pads' displacement at once, for pads that creep."""
+    """Forces (T, N, 4) that would displace the pads as far at once, for pads that creep."""
     if not world.modes[CREEPING]:
         return force
     return force + world.creep * (lowpass(force, world.creep_time, sampling_interval(world)) - force)
 
 
-# Grips: how firmly they hold, and values less what stays the same while one holds.
+# Grips: how firmly they hold, and positions relative to the constants of each grip.
 
-HELD = 0.1  # chosen: N; a grip below this holds nothing,
-# chosen: nor one below this share of its usual force: pads that let go slide by what shears they bear
+HELD = 0.1  # chosen: N; a weaker grip holds nothing,
+# chosen: nor one below this share of its usual force: pads that let go slide by as much as they shear
 LOOSE = 0.35
 USUAL = 11.0  # numerics: logit of the weight of a grip of the usual force
-SLIDE = 2e-3  # prior: m; how far a pad may slide from one sample to the next
-ANYWHERE = 0.05  # prior: m; sd of where a grip takes its block
+SLIDE = 2e-3  # prior: m; slip of a pad from one sample to the next
+ANYWHERE = 0.05  # prior: m; sd of the place at which a grip takes its block
 
 
 def firmness(grip: np.ndarray, held: np.ndarray, moves: np.ndarray, loose: float = LOOSE) -> np.ndarray:
-    """How surely (T, N) a grip's pads hold the block rather than slide on it as they close or let go."""
+    """How surely (T, N) a grip's pads hold the block rather than slide on it while they close or open."""
     mine = moves * held[..., None]
     usual = (grip[:, None] @ mine)[:, 0] / np.maximum(mine.sum(1), 1.0)
     least = np.maximum(HELD, loose * (moves @ usual[..., None])[..., 0])
@@ -233,8 +237,8 @@ def recorded(arrays: Arrays, channel: str) -> np.ndarray:
     return arrays.there[..., CHANNELS.index(channel)]
 
 
-# prior: shares of the variance of anywhere in a dead band, by which joints move unseen between two samples,
-# and their chances: as a rule they do not
+# prior: variances of unseen motion of joints between two samples, as shares of that of anywhere in the dead
+# band, and their probabilities: usually there is none
 SHARES, CHANCES = np.array([0.0, 0.01, 1.0]), np.array([0.8, 0.1, 0.1])
 
 
@@ -242,13 +246,22 @@ def in_grip(
     values: np.ndarray, weight: np.ndarray, noise: np.ndarray, firm: np.ndarray, world: World,
     arrays: Arrays,
 ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
-    """x, y, distance and offset (T, N, 4), of which all but the distance are one constant in every grip, less
-    their prediction from the samples before; its variance over the `noise`'s squared, and what unseen moves
-    cost [nats].
+    """x, y, distance and offset (T, N, 4) minus their prediction from earlier samples.
 
-    A block on the ground is taken along by a hand that moves: it stays where it was pushed to. Pads may
-    slide, and joints move in their dead bands. A grip's first value sets its constant and says nothing; the
-    distance counts as `firm`ly as the block is held.
+    All but the distance are constant within a grip, except that a hand that moves takes a block on the ground
+    along, pads may slide, and joints move within their dead bands. The first value of a grip sets its
+    constant and is no evidence.
+
+    Args:
+        values: x, y, distance and offset (T, N, 4) [m].
+        weight: Weight (T, N, 4) of each value.
+        noise: Its standard deviation (T, N, 4).
+        firm: How surely (T, N) the block is held; weighs the distance.
+        world: The world, corrected for effects.
+        arrays: Constants of the equations.
+
+    Returns:
+        Residuals, their variance over the squared noise, and the cost of unseen motion [nats].
     """
     from simgap.recursions import tracked
 
@@ -272,19 +285,26 @@ def _wider(values: np.ndarray) -> np.ndarray:
     return np.maximum(values, np.concatenate([values[:, :1], values[:, :-1]], 1))
 
 
-TOUCH = 2e-5  # numerics: m; the corner of contact is rounded over this depth, below the joints' resolution
-SURE = 4.0  # chosen: sds of the distance by which fingers must be nearer than the block is wide to touch it
-CLOSED = 0.8  # chosen: share of its usual force by which a grip has closed: until then it pushes the block
+TOUCH = 2e-5  # numerics: m; the onset of contact is rounded over this depth, below the joints' resolution
+SURE = 4.0  # chosen: sds of the distance by which fingers must be closer than the block's width to touch it
+CLOSED = 0.8  # chosen: share of its usual force at which a grip has closed: until then it pushes the block
 
 
 def residuals(
     world: World, arrays: Arrays, properties: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Residuals (T, N, C) in units of the channels, how far their variance exceeds `noise` squared, and what
-    joints cost [nats] that move unseen.
+    """Residuals of the contact equations.
 
-    `properties` (O, 3): weight, width, height. The variance's factor is 1 where the correction of an effect
-    leaves nothing in doubt.
+    Args:
+        world: The world, corrected for effects.
+        arrays: Constants of the equations.
+        properties: Weight [N], width and height [m] of the blocks (O, 3).
+        noise: Standard deviation (T, N, C) of the residuals.
+
+    Returns:
+        Residuals (T, N, C) in units of the channels, their variance over the squared noise (1 where
+            corrections
+        leave no doubt), and the cost of unseen motion of joints [nats].
     """
     weight, width = np.moveaxis(arrays.onehot @ (arrays.objects @ properties[:, :2]), -1, 0)
     rise = arrays.onehot @ (arrays.rises @ properties[:, 2])
@@ -300,14 +320,14 @@ def residuals(
     pads_give = Pads(n1, n2, s1, s2)
     gap = x2 - x1 - width
     squeeze = block_width(0.0, fx1, fx2, pads_give)
-    # Pads that have crept come back late: fingers may be nearer for a while without pressing.
+    # Pads that have crept recover late: fingers may be closer for a while without pressing.
     late = (pads - force)[..., 0] * n1 - (pads - force)[..., 2] * n2
-    # A distance known to so much says nothing of a lighter touch: its noise would come out as force.
+    # The distance does not determine lighter touches: its noise would appear as force.
     unsure = SURE * arrays.sd[..., CHANNELS.index("distance")]
     touching = TOUCH * np.logaddexp(0.0, -(gap + late + unsure * world.free) / TOUCH)
     held = world.ground + world.carry
     firm = firmness(0.5 * (force[..., 0] - force[..., 2]), held, arrays.onehot)
-    # Held firmly the fingers are as far apart as the block is wide, pads or none; else only not nearer.
+    # In a firm grip the fingers are as far apart as the block is wide, pads or none; else only not closer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = arrays.phase[..., Phase.PLACE]
     offset = block_offset(y2 - y1, fy1, fy2, pads_give) + world.hang * width * world.carry
@@ -315,7 +335,7 @@ def residuals(
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + sunk(world, load)
     y = y - np.tan(world.tilt) * (x1 + x2) / 2 - rise * place
-    # Fingers that close push the block and slide on it until both hold it: only then it rests.
+    # Closing fingers push the block and slide on it; it rests only once both hold it.
     lesser = np.minimum(force[..., 0], -force[..., 2])
     both = firmness(lesser, held, arrays.onehot, CLOSED)
     closed = firm * both
@@ -345,7 +365,7 @@ def residuals(
     mean_p = (position[..., :2] + position[..., 2:]) / 2
     mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
     speeds = _compact(mean_v) - gradient(world.t, mean_p)
-    # In the units of what was recorded: an effect must not gain by scaling the noise down.
+    # In recorded units: an effect must not gain by scaling the noise down.
     size = np.mean(world.link)
     return (
         np.concatenate([geometry / size, speeds / size, forces], -1),
@@ -355,7 +375,7 @@ def residuals(
 
 
 def _doubt(world: World, firm: np.ndarray) -> np.ndarray:
-    """Variance (T, N, 4) [m^2] of x, y, distance and offset from what is in doubt of forces."""
+    """Variance (T, N, 4) [m^2] of x, y, distance and offset from the uncertainty of forces."""
     if not (world.modes[LATE] or world.modes[SMOOTH]):
         return np.zeros((*firm.shape, 4))
     pads = doubt_between(world)
@@ -365,13 +385,13 @@ def _doubt(world: World, firm: np.ndarray) -> np.ndarray:
 
 
 def _compact(v: np.ndarray) -> np.ndarray:
-    """(v[k-1] + 4 v[k] + v[k+1]) / 6, the mean velocity that central differences have to fourth order."""
+    """(v[k-1] + 4 v[k] + v[k+1]) / 6, the mean velocity of central differences to fourth order."""
     inner = (v[:, :-2] + 4 * v[:, 1:-1] + v[:, 2:]) / 6
     return np.concatenate([inner[:, :1], inner, inner[:, -1:]], 1)
 
 
 def contact(world: World) -> np.ndarray:
-    """Forces (T, N, 4) of the contacts: before delay and low-pass, before they rang a mode, without loads."""
+    """Contact forces (T, N, 4): before delay, low-pass and ringing, without loads."""
     force = world.force
     if world.modes[RINGING]:
         force = driven(world, force, back=True)

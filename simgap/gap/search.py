@@ -1,4 +1,4 @@
-"""Every candidate fitted to aligned trials; boundaries realigned without what displaced them."""
+"""Fit every candidate to aligned trials, and realign boundaries that the best one has displaced."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.problem import Gap
 from simgap.bounded import least
-from simgap.effects import catalogue, forms_of, free_parameters, name_of
+from simgap.effect import Parameter
+from simgap.effects import catalogue, forms_of, name_of
 from simgap.effects.base import tips
 from simgap.gap.assemble import Scatter, gap_of, noise_gained, redrawn, scatters
 from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
@@ -25,109 +26,111 @@ from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import (
     Fitted,
     Problem,
-    Start,
     columns_of,
-    cost_at,
     evaluated,
     fit,
+    free_of,
     limits,
     neutral,
     problem,
     rebased,
-    slots,
     world_without,
 )
 from simgap.gap.residuals import SURE
 from simgap.progress import Progress, silent
 
-# Every candidate effect fitted by itself: all starts of its shape parameters screened, the best refined.
+# Each candidate effect fitted separately: all starts of its gridded parameters are screened, the best
+# refined.
 
 SCREEN = 2  # numerics: steps before the best start of a form is chosen
-LEADERS = 3  # numerics: starts screened
+LEADERS = 3  # numerics: starts that take these steps
 PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be fitted
 
 
 def candidate_names(rig: Rig, excluded: Sequence[str] = (), forced: Sequence[str] = ()) -> list[str]:
-    """The effects to choose from, or that are `forced`: a Cartesian hand has no joints."""
+    """Effects to choose from, and those that are `forced`; a Cartesian hand has no joints."""
     chosen = {n: e for n, e in catalogue().items() if e.chosen or n in forced}
     return [n for n, e in chosen.items() if n not in excluded and (rig.jointed or e.acts_on != "kinematics")]
 
 
 def shifting(names: Sequence[str]) -> list[str]:
-    """Keys of all forms of those effects that shift signals (the others only scatter them)."""
+    """Keys of all forms of the named effects that shift signals rather than scatter them."""
     return [key for n in names if catalogue()[n].correct is not None for key in forms_of(n)]
 
 
-def starts(given: Problem, key: str, others: tuple[str, ...], base: np.ndarray) -> list[Start]:
-    """Starts of one form of an effect after `others`, from other coordinates `base` (all columns)."""
-    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
-    grids = [
-        [(slot.start + j, p.coordinate(value)) for value in p.starts]
-        for j, p in enumerate(slot.effect.parameters.values())
-        if p.gridded and p.name in free_parameters(key)
-    ]
+def _gridded(given: Problem, key: str) -> list[tuple[int, Parameter]]:
+    """Columns and parameters of an effect's form that are started from every point of a grid."""
+    own = columns_of(given, (key,))[given.num_properties :]
+    return [(int(c), p) for c, p in zip(own, free_of(key), strict=True) if p.gridded]
+
+
+def starts(given: Problem, key: str, base: np.ndarray) -> list[np.ndarray]:
+    """Coordinates from which one form of an effect is fitted; all but its gridded ones as in `base`."""
+    grids = [[(column, p.coordinate(value)) for value in p.starts] for column, p in _gridded(given, key)]
     out = []
     for chosen in itertools.product(*grids):
         u = base.copy()
         for column, value in chosen:
             u[column] = value
-        out.append(Start((*others, key), u))
+        out.append(u)
     return out
 
 
 def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMISING) -> Fitted:
-    """The best fit of one form of an effect, properties and the effects of `healthy` refitted; not refined
-    where a linear step gains less than what is `promising` [nats].
+    """Fit one form of an effect after those of `healthy`, which are refitted with the properties.
 
-    Starts are ranked by what a linear step in their amplitudes leaves: a frequency cannot be sought while
-    what swings with it has no size. Properties start as they were measured, for without the effect they may
-    have been drawn far off, and from where they are, for fingers that are off may seem to touch blocks.
+    Starts are ranked by the cost after a linear step in their amplitudes: a frequency cannot be found while
+    its oscillation has no size. Properties start at their measured values, as without the effect they may
+    have been pulled far off, and also at those of `healthy`, since displaced fingers may seem to touch
+    blocks.
+
+    Args:
+        given: The problem.
+        key: The form.
+        healthy: The fit to start from.
+        promising: Gain of a linear step [nats] below which the start is not refined.
     """
-    base, usual = healthy.u.copy(), healthy.push[:, : given.num_properties]
+    base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_properties]
     base[: given.num_properties][given.measured.ravel()] = 0.0
-    drawn = np.abs(healthy.u - base).max() > SURE  # by more than a touch is doubted
-    every = [s for u in (base, healthy.u)[: 1 + drawn] for s in starts(given, key, healthy.effects, u)]
-    ranked = sorted(((*_ranked(given, start, usual), start) for start in every), key=lambda r: r[0])
+    drawn = np.abs(healthy.u - base).max() > SURE  # more than the uncertainty of a touch
+    effects = (*healthy.effects, key)
+    every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
+    ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < promising:
-        return fit(given, ranked[0][2], 0, usual)
-    leading = [start for _, start, _ in ranked[:LEADERS]]
+        return fit(given, effects, ranked[0][2], 0, usual)
+    leading = [u for _, u, _ in ranked[:LEADERS]]
     if len(leading) > 1:
-        screened = sorted((fit(given, s, SCREEN, usual) for s in leading), key=lambda f: f.cost)
-        leading = [Start(screened[0].effects, screened[0].u)]
-    return fit(given, leading[0], usual=usual)
+        leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
+    return fit(given, effects, leading[0], usual=usual)
 
 
-def _ranked(given: Problem, start: Start, usual: np.ndarray) -> tuple[float, Start]:
-    """A start's cost after a linear step of all but its gridded parameters, and the start there."""
-    key = start.effects[-1]
-    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name_of(key))
-    fixed = [
-        slot.start + j
-        for j, p in enumerate(slot.effect.parameters.values())
-        if p.gridded and p.name in free_parameters(key)
-    ]
+def _linear_step(
+    given: Problem, effects: tuple[str, ...], start: np.ndarray, usual: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Cost after one linear step of all but the last effect's gridded parameters, and the coordinates
+    there."""
+    fixed = [column for column, _ in _gridded(given, effects[-1])]
     low, high = limits(given)
-    columns = np.array([c for c in columns_of(given, start.effects) if c not in fixed])
-    u = start.u.copy()
+    columns = np.array([c for c in columns_of(given, effects) if c not in fixed])
+    u = start.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    at = cost_at(given, start.effects, u, columns, [])
-    now = evaluated(given, start.effects, u, columns, at, usual)
-    bend = given.product(now.push, now.push) + np.eye(columns.size)
-    pull = -given.product(now.push, now.residual) - u[columns]
-    step, _ = least(bend, pull, low[columns] - u[columns], high[columns] - u[columns])
+    now = evaluated(given, effects, u, columns, usual)
+    curvature = given.product(now.jacobian, now.jacobian) + np.eye(columns.size)
+    pull = -given.product(now.jacobian, now.residual) - u[columns]
+    step, _ = least(curvature, pull, low[columns] - u[columns], high[columns] - u[columns])
     there = u.copy()
     there[columns] = np.clip(u[columns] + step, low[columns], high[columns])
-    left = now.residual + now.push @ (there[columns] - u[columns])
+    left = now.residual + now.jacobian @ (there[columns] - u[columns])
     own = there[: given.num_properties]
     cost = 0.5 * float(given.product(left, left)) + now.doubts + 0.5 * float(own @ own)
-    return cost, Start(start.effects, there)
+    return cost, there
 
 
-# Align again with an effect taken out: late or softened forces displace the boundaries themselves.
+# Realignment after correction for an effect: late or softened forces displace the boundaries themselves.
 
 
 def realigned(aligned: AlignedTrials, given: Problem, found: Fitted, all_fit: bool = False) -> AlignedTrials:
-    """Boundaries of the trials in the frame, from signals that the candidate has been taken out of."""
+    """Align the trials of a frame from signals corrected for a candidate."""
     frame, rig, trials = given.frame, given.frame.rig, [a.trial for a in aligned.trials]
     world = world_without(given, found.effects, found.u)
     (position, velocity), force = tips(world), world.force
@@ -153,7 +156,7 @@ def _hand(rig: Rig, world) -> Rig:
 
 
 def moved(before: AlignedTrials, after: AlignedTrials) -> float:
-    """Largest shift of a boundary [s]; infinite where a trial no longer fits its task."""
+    """Largest shift of a boundary [s]; infinite if a trial no longer fits its task."""
     shifts = []
     for a, b in zip(before.trials, after.trials, strict=True):
         if not b.segmentation.complete:
@@ -165,18 +168,28 @@ def moved(before: AlignedTrials, after: AlignedTrials) -> float:
 
 
 SHIFT = 0.008  # chosen: s; boundaries that move farther are realigned
-ROUNDS = 2  # numerics: times at most
-ATTEMPTS = 3  # numerics: leading candidates that are taken out in turn where no trial fits its task
-HOPELESS = 1e4  # chosen: times the noise's square, in the mean: no effect of a hand, but another task
-WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be realigned without it
+ROUNDS = 2  # numerics: most realignments
+ATTEMPTS = 3  # numerics: leading candidates tried in turn if no trial fits its task
+HOPELESS = 1e4  # chosen: mean square over the noise's; more is another task and no effect of a hand
+WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be realigned
 Identified = Mapping[tuple[str, str], float]
 
 
 @dataclass(frozen=True)
 class Search:
-    """Aligned `trials`, their `problem`, the fit without any effect, and every candidate's own; `gap`: all of
-    that as an attribution takes it, its first candidates those of `fits`; `redrawn`: the problem with more
-    noise on the recordings; `identified`: the blocks' properties as `identify` has them [N, m]."""
+    """Every candidate fitted to aligned trials.
+
+    Attributes:
+        aligned: The trials that fit their task.
+        problem: Their fitting problem.
+        healthy: Its fit without effects.
+        fits: The fit of each form of an effect that shifts signals.
+        scatters: The effects that scatter residuals.
+        gap: The gap with all of these as candidates, first those of `fits`.
+        redrawn: The problem with additional noise on the recordings.
+        identified: Identified properties [N, m].
+        warnings: One line each.
+    """
 
     aligned: AlignedTrials
     problem: Problem
@@ -195,9 +208,9 @@ class Search:
 
     @property
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weight, width, height (O, 3) of the blocks, and which are known: measured apart or identified.
+        """Weight, width and height (O, 3) of the blocks, and which are known: measured apart or identified.
 
-        What is measured is as the recordings leave it, what nothing determines as the prior does.
+        Measured values are those of the fit; what nothing determines is at its prior.
         """
         values, known = self.problem.properties(self.healthy.u), self.problem.measured.copy()
         for (name, kind), value in self.identified.items():
@@ -217,11 +230,21 @@ def search(
     noisy: bool = True,
     promising: float = PROMISING,
 ) -> Search:
-    """Fit the catalogue, and what is `forced`, to aligned trials; InputError where none fits its task.
+    """Fit the catalogue, and effects that are `forced`, to aligned trials.
 
-    `identified`: what `identify` made of the same trials, where that is known already. `noisy`: whether to
-    see what sensors' noise makes of the candidates (`simgap.gap.assemble.redrawn`), which takes half of the
-    time. `promising`: see `best_fit`.
+    Args:
+        aligned: The trials.
+        actual: Measured properties.
+        excluded: Effects that are not considered.
+        forced: Effects considered in any case.
+        tell: Called with a description of each stage.
+        identified: Properties identified from the same trials, if known.
+        noisy: Whether to estimate the effect of sensor noise on the candidates
+            (`simgap.gap.assemble.redrawn`), which takes half of the time.
+        promising: See `best_fit`.
+
+    Raises:
+        InputError: No trial fits its task.
     """
     misled: list[str] = []
     names, trials = candidate_names(aligned.rig, excluded, forced), [one.trial for one in aligned.trials]
@@ -239,7 +262,7 @@ def search(
     identified = identified or {}
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
-    healthy = fit(given, Start((), neutral(given)))
+    healthy = fit(given, (), neutral(given))
     fits = [best_fit(given, key, healthy, promising) for key in keys]
     others = redrawn(given) if noisy else ()
     for _ in range(ROUNDS if noisy else 0):
@@ -271,10 +294,10 @@ def _anew(
     fits: Sequence[Fitted],
     others: Sequence[Problem],
 ):
-    """Everything once more with boundaries from signals without the best explanation, if that fits better, or
-    if more of `every` trial then fits its task.
+    """Refit everything with boundaries from signals corrected for the best explanation.
 
-    Late, slow or soft contacts displace boundaries, and what displaces fingers may look like a dropped block.
+    None unless that fits better, or more of all trials (`every`) then fit their task: late, slow or soft
+    contacts displace boundaries, and displaced fingers may look like a dropped block.
     """
     best = min(fits, key=lambda f: f.cost)
     gained = healthy.cost - best.cost
@@ -285,23 +308,21 @@ def _anew(
     if recovered is None and not SHIFT < moved(aligned, again) < np.inf:
         return None
     other = with_nuisances(rebased(build(again), given))
-    if recovered is None and (
-        fit(other, Start(best.effects, best.u)).cost / other.size > best.cost / given.size
-    ):
+    if recovered is None and fit(other, best.effects, best.u).cost / other.size > best.cost / given.size:
         return None
-    plain = fit(other, Start((), healthy.u))
-    return again, other, plain, [fit(other, Start(f.effects, f.u), usual=plain.push) for f in fits]
+    plain = fit(other, (), healthy.u)
+    return again, other, plain, [fit(other, f.effects, f.u, usual=plain.jacobian) for f in fits]
 
 
 def _recovered(
     every: AlignedTrials, aligned: AlignedTrials, given: Problem, best: Fitted
 ) -> AlignedTrials | None:
-    """The trials that fit their task once the best explanation has been taken out, if these are more."""
+    """The trials that fit their task once corrected for the best explanation; None unless these are more."""
     if len(aligned.trials) == len(every.trials):
         return None
     forced = align([one.trial for one in every.trials], every.task, every.rig, all_fit=True)
     frame = build(forced)
-    if not np.isfinite(frame.world.events).all():  # nowhere in these trials a block could be held
+    if not np.isfinite(frame.world.events).all():  # no block is held anywhere
         return None
     again = realigned(forced, rebased(frame, given), best)
     fit_now = tuple(one for one in again.trials if one.segmentation.failed is None)
@@ -311,15 +332,17 @@ def _recovered(
 def _aligned_all(
     failed: AlignedTrials, actual: dict | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
-    """Another alignment of trials that all `failed`, if most fit their task without one of the candidates.
+    """Realign trials that all failed, if most fit their task after correction for one of the candidates.
 
-    Forces that a fault displaces may look like another task. Where no candidate helps, `failed` as it is; the
-    second is a warning that says which one did.
+    Forces displaced by a fault may look like another task.
+
+    Returns:
+        The trials, as they were if no candidate helps, and a warning that names the one that does.
     """
     aligned = align([one.trial for one in failed.trials], failed.task, failed.rig, all_fit=True)
     for _ in range(ROUNDS):
         given = problem(build(aligned), actual)
-        healthy = fit(given, Start((), neutral(given)))
+        healthy = fit(given, (), neutral(given))
         if healthy.cost > HOPELESS * given.size:
             break
         found = sorted((best_fit(given, key, healthy) for key in keys), key=lambda f: f.cost)
@@ -342,7 +365,7 @@ def _complete(aligned: AlignedTrials) -> AlignedTrials:
 
 
 def _failures(every: AlignedTrials, aligned: AlignedTrials) -> list[str]:
-    """A warning of each trial that did not fit its task at first: whether it is left out."""
+    """A warning for each trial that did not fit its task at first: whether it is left out."""
     kept, out = {one.trial.name for one in aligned.trials}, []
     for one in every.trials:
         if one.segmentation.failed is not None:

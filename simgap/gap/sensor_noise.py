@@ -1,7 +1,8 @@
-"""Noise of channels and of residuals [units of the channel], from the rig or learned from a recording."""
+"""Noise of channels and residuals [units of the channel], stated by the rig or estimated from a recording."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -10,28 +11,20 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.segmentation.emissions import noise_sd
 
-# What happens between two samples: speeds and accelerations that jump, blocks that fingers push.
+# Changes between two samples: jumps of velocities and accelerations, blocks pushed by fingers.
 #
-# No rule through samples gives a motion that changes faster than they are taken. How far it is off shows in
-# differences of a high order, which smooth motion hardly has.
+# No rule that combines samples reproduces motion that changes faster than they are taken. Its error shows in
+# differences of high order, which are small for smooth motion.
 
 SEEN = 2.0  # prior: sds of a fourth difference below which it is noise
 FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)  # numerics: weights of a fourth difference
-MEDIAN = 0.4549  # physics: of the square of a standard normal number
-JUMPS = 64  # numerics: moments between two samples that a mean is taken over
-MOVES = 3.0  # chosen: sds of a difference by which fingers move
-
-
-def pushed(place: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """By how much (N,) fingers move from sample to sample beyond noise: what they hold does not rest then.
-
-    The finger that touches first pushes the block for a while, and so does a hand that closes.
-    """
-    return changes(place, noise)
+MEDIAN = 0.4549  # physics: median of the square of a standard normal number
+JUMPS = 64  # numerics: moments between two samples that are averaged over
+MOVES = 3.0  # chosen: sds of a difference above which fingers move
 
 
 def changes(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """The larger change (N, ...) to either neighbour beyond what `noise` (N,) makes; none where missing."""
+    """Larger change (N, ...) to either neighbour in excess of `noise` (N,); zero where missing."""
     step = np.abs(np.nan_to_num(np.diff(values, axis=0)))
     step = np.pad(step, [(1, 1), *[(0, 0)] * (values.ndim - 1)])
     usual = MOVES * np.sqrt(2.0) * noise.reshape(-1, *[1] * (values.ndim - 1))
@@ -39,10 +32,11 @@ def changes(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 
 def speed_jumps(place: np.ndarray, noise: np.ndarray, step: float, group: int) -> np.ndarray:
-    """How far (N,) the rule for speeds is off where they jump between samples, rms over when they do.
+    """Root mean square error (N,) of the rule for velocities where they jump between samples.
 
-    The jump shows in the fourth difference of the positions, which are known far better than speeds: how
-    loud those are makes it no smaller. What irregular sample times do wherever a finger moves is no jump.
+    The jump is read from the fourth difference of the positions, which are much more accurate than
+    velocities: noise of the latter does not hide it. Changes that irregular sample times cause in any motion
+    are no jumps.
     """
     bend, speed, norm = np.zeros_like(place), np.zeros_like(place), np.linalg.norm(FOURTH)
     place = np.nan_to_num(place)
@@ -53,20 +47,28 @@ def speed_jumps(place: np.ndarray, noise: np.ndarray, step: float, group: int) -
     late = 0.0
     if moving.any():
         seen = (bend**2 / (MEDIAN * norm**2) - noise**2)[moving]
-        late = max(float(np.median(seen / speed[moving] ** 2)), 0.0)  # s^2, variance of the sample times
+        late = max(float(np.median(seen / speed[moving] ** 2)), 0.0)  # s^2; variance of the sample times
     usual = SEEN * norm * np.sqrt(noise**2 + late * speed**2)
     return _of_a_jump(group) / step * np.sqrt(np.maximum(near**2 - usual**2, 0.0))
 
 
-@cache
-def _of_a_jump(group: int) -> float:
-    """What the rule (1, 4, 1) / 6 for speeds leaves where one jumps, over the fourth difference of positions.
+def _sampled(group: int, *courses: Callable[[np.ndarray], np.ndarray]) -> list[np.ndarray]:
+    """15 samples (JUMPS, 15) of courses about each moment of a jump, means over `group` finer ones.
 
-    In the mean square over when it jumps between two samples, each a mean over `group` finer ones.
+    Time is in samples from the jump.
     """
     when = (np.arange(JUMPS) + 0.5) / JUMPS
     t = (np.arange(15 * group) - 7 * group + 0.5) / group - when[:, None]
-    place, speed = (z.reshape(JUMPS, 15, group).mean(2) for z in (np.maximum(t, 0.0), 1.0 * (t > 0)))
+    return [course(t).reshape(JUMPS, 15, group).mean(2) for course in courses]
+
+
+@cache
+def _of_a_jump(group: int) -> float:
+    """Error of the rule (1, 4, 1) / 6 for velocities at a jump, over the fourth difference of positions.
+
+    Root mean square over the moment of the jump between two samples, each a mean over `group` finer ones.
+    """
+    place, speed = _sampled(group, lambda t: np.maximum(t, 0.0), lambda t: 1.0 * (t > 0))
     rule = (speed[:, :-2] + 4 * speed[:, 1:-1] + speed[:, 2:]) / 6 - (place[:, 2:] - place[:, :-2]) / 2
     bend = np.abs(np.stack([np.convolve(row, FOURTH, "valid") for row in place]))
     bend = np.pad(bend, ((0, 0), (2, 2)))
@@ -75,14 +77,15 @@ def _of_a_jump(group: int) -> float:
 
 
 def kinks(speed: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Fourth differences (N,) of a speed near each sample, beyond those of its `noise` (N,): its
-    acceleration jumps there."""
+    """Fourth differences (N,) of a velocity near each sample in excess of its `noise` (N,): jumps of
+    acceleration.
+    """
     usual = SEEN * np.linalg.norm(FOURTH) * noise
     return np.sqrt(np.maximum(_near(speed) ** 2 - usual**2, 0.0))
 
 
 def _near(speed: np.ndarray) -> np.ndarray:
-    """The largest fourth difference (N,) that each sample takes part in."""
+    """Largest fourth difference (N,) that involves each sample."""
     reach = len(FOURTH) - 1
     every = np.pad(np.abs(np.convolve(np.nan_to_num(speed), FOURTH, "valid")), (reach, reach))
     return np.max([every[k : k + speed.size] for k in range(reach + 1)], axis=0)
@@ -90,15 +93,17 @@ def _near(speed: np.ndarray) -> np.ndarray:
 
 @cache
 def of_a_kink(group: int) -> tuple[float, float]:
-    """What the rule (1, 4, 1) / 6 for speeds, and differences of five speeds over a sample, leave where the
-    acceleration jumps, over the speeds' fourth difference.
+    """Errors at a jump of the acceleration, over the fourth difference of velocities.
 
-    In the mean square over when it jumps between two samples, each a mean over `group` finer ones.
+    Root mean squares over the moment of the jump between two samples, each a mean over `group` finer ones.
+
+    Returns:
+        Those of the rule (1, 4, 1) / 6 for velocities and of slopes from five velocities (times the time
+            step).
     """
-    when = (np.arange(JUMPS) + 0.5) / JUMPS
-    t = (np.arange(15 * group) - 7 * group + 0.5) / group - when[:, None]
-    ramp = np.maximum(t, 0.0)
-    place, speed, rate = (z.reshape(JUMPS, 15, group).mean(2) for z in (ramp**2 / 2, ramp, 1.0 * (t > 0)))
+    place, speed, rate = _sampled(
+        group, lambda t: np.maximum(t, 0.0) ** 2 / 2, lambda t: np.maximum(t, 0.0), lambda t: 1.0 * (t > 0)
+    )
     mean = (speed[:, 1:-3] + 4 * speed[:, 2:-2] + speed[:, 3:-1]) / 6 - (place[:, 3:-1] - place[:, 1:-3]) / 2
     near, far = speed[:, 3:-1] - speed[:, 1:-3], speed[:, 4:] - speed[:, :-4]
     slope = (4 * near / 2 - far / 4) / 3 - rate[:, 2:-2]
@@ -107,18 +112,19 @@ def of_a_kink(group: int) -> tuple[float, float]:
 
 
 UNSEEN = 0.03  # prior: share of a force's change between samples that no model of 20 Hz samples determines,
-# chosen: and of that with which a block comes off its support or onto it: how fast is not recorded
+# chosen: and of the change as a block leaves or meets its support, whose speed is not recorded
 STARTING = 0.1
-FADED, FADING = 0.1, 0.5  # prior: the same of what is recorded in free motion, so many seconds from a grip
-ROCKING = 0.1  # prior: a block that is pushed rocks: its sides rise by so much of how far it goes, sd
-FOAM = 2e-3  # prior: s; a pad's damping over its stiffness, as `simgap.world.virtual_model` has it
-NUDGE = 1e-4  # prior: m; fingers that push unequally move a resting block by about as much
+FADED, FADING = 0.1, 0.5  # prior: share of forces in free motion, so many seconds from a grip
+ROCKING = 0.1  # prior: rise of a pushed block's sides as it rocks, relative to its motion, sd
+FOAM = 2e-3  # prior: s; a pad's damping over its stiffness, as in `simgap.world.virtual_model`
+NUDGE = 1e-4  # prior: m; motion of a resting block between fingers that push unequally
 
 
 def sample_noise(s: Signals, group: int) -> dict[str, np.ndarray]:
-    """Noise (N,) of one finger's x, y, vx, vy and force, of means over `group` samples.
+    """Noise (N,) of one finger's x, y, vx, vy and force, as means over `group` samples.
 
-    A jointed finger's changes with its pose. Learned from the recording where the rig does not state it.
+    That of a jointed finger varies with its pose. What the rig does not state is estimated from the
+    recording.
     """
 
     def known(stated: np.ndarray | float, values: np.ndarray, factor: float) -> np.ndarray:
@@ -126,7 +132,7 @@ def sample_noise(s: Signals, group: int) -> dict[str, np.ndarray]:
         there = np.isfinite(each)
         if there.any():
             return np.where(there, each, np.median(each[there])) / np.sqrt(group)
-        learned = noise_sd(values) * factor  # of what is averaged already
+        learned = noise_sd(values) * factor  # of averaged samples
         return np.full(s.t.shape, max(learned if np.isfinite(learned) else 0.0, 1e-9))
 
     root2 = np.sqrt(2.0)
@@ -140,11 +146,17 @@ def sample_noise(s: Signals, group: int) -> dict[str, np.ndarray]:
 def sensor_sd(
     joints: np.ndarray, rates: np.ndarray, one: dict[str, np.ndarray], rig: Rig, group: int
 ) -> np.ndarray:
-    """Noise (N, 3) of what was recorded, means over `group` samples: an angle [rad] (a coordinate [m] of a
-    Cartesian hand), its rate and a force [N]. `joints`, `rates` (N, 4); `one` of `sample_noise`.
+    """Noise (N, 3) of recorded angles [rad] (coordinates [m] of a Cartesian hand), their rates, and forces
+    [N].
 
-    Not more than the recording shows: means of speeds that a drive makes of its angles are quieter than what
-    is stated of one.
+    It is no larger than the recording shows: means of velocities that a drive derives from angles are quieter
+    than the stated noise of a single one.
+
+    Args:
+        joints, rates: Angles and rates (N, 4), means over `group` samples.
+        one: Noise of one finger, from `sample_noise`.
+        rig: The hand.
+        group: Number of samples averaged into one.
     """
     stated = (one["x"], one["vx"]) if not rig.jointed else (rig.noise.angle, rig.noise.velocity)
     out = np.empty((len(joints), 3))
@@ -165,8 +177,11 @@ def channel_noise(one: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def residual_noise(one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndarray:
-    """Noise (N, C) of each channel's residual: positions with the pads' yielding taken out, velocities less
-    differences of positions `step` s apart."""
+    """Noise (N, C) of each channel's residual.
+
+    Positions are corrected for the pads' compression; velocities are compared with differences of positions
+    `step` seconds apart.
+    """
     pad, root2 = rig.fingertip, np.sqrt(2.0)
     x, y, vx, vy, f = (one[k] for k in ("x", "y", "vx", "vy", "force"))
     gn, gs = f / pad.normal_stiffness, f / pad.shear_stiffness
@@ -181,11 +196,18 @@ def residual_noise(one: dict[str, np.ndarray], rig: Rig, step: float) -> np.ndar
 def motion_doubt(
     s: Signals, one: dict[str, np.ndarray], push: np.ndarray, step: float, group: int, pad: Fingertip
 ) -> np.ndarray:
-    """How far (N, C) residuals are off beyond noise where motion is not what equations take it for, sd.
+    """Standard deviation (N, C) of errors of the residuals' equations, beyond noise.
 
-    Blocks that fingers `push` (N,) [m] rock, and speeds that change within a sample, as that of a pressed
-    fingertip that is released, no rule gives; while pads give way quickly, their damping bears a part of the
-    force. Samples are means over `group` finer ones.
+    Pushed blocks rock, and no rule reproduces velocities that change within a sample, such as that of a
+    released fingertip. While pads deform quickly, their damping carries a part of the force.
+
+    Args:
+        s: Task-space signals.
+        one: Noise of one finger, from `sample_noise`.
+        push: Motion of the fingers (N,) beyond noise [m].
+        step: Time between samples [s].
+        group: Number of recorded samples averaged into one.
+        pad: The fingertip.
     """
     root2, out = np.sqrt(2.0), np.zeros((s.t.size, 10))
     out[:, 0], out[:, 1], out[:, 3] = NUDGE, ROCKING * push, 2 * ROCKING * push
@@ -210,9 +232,8 @@ def between_samples(
 ) -> np.ndarray:
     """What no model of coarse samples determines (N, 4) of net fx, net fy, grip and shear [N].
 
-    A share of the largest change from sample to sample, two samples around, more of it where a carry is
-    `starting` or ending; and just after a grip a share of what is still recorded, for it tells of forces
-    between samples.
+    A share of the largest change between samples within two samples, larger where a carry is `starting` or
+    ending. Just after a grip, in addition, a share of the recorded force, which stems from between samples.
     """
     every = np.concatenate([force[:, :2] + force[:, 2:], (force[:, :2] - force[:, 2:]) / 2], 1)
     step = np.pad(np.abs(np.diff(every, axis=0)), ((2, 2), (0, 0)))

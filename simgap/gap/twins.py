@@ -1,8 +1,8 @@
-"""Healthy twins: this task, rig and pace, these blocks, grips and sensors, simulated and diagnosed alike.
+"""Healthy twins: the recorded task, rig, pace, blocks, grips and sensors, simulated and diagnosed alike.
 
-The statistic of a recording is a log Bayes factor; that of a healthy one exceeds s with a probability of
-exp(-s) at most, if the model is right. It is never quite right: twins show by how much the factor is off for
-recordings like these (`simgap.attribution.search.detected`).
+The statistic of a recording is a log Bayes factor; that of a healthy one exceeds s with a probability of at
+most exp(-s) if the model is right. No model is exactly right: twins show how far off it is for recordings
+like these (`simgap.attribution.search.detected`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from simgap.world.replay import QUICKEST, plan_again
 from simgap.world.simulate import SimulatedTrial, noise_sd, record, simulate_plans, simulate_trials
 from simgap.world.virtual_model import Surroundings
 
-# Simulated recordings with known effects: what the diagnosis is calibrated on.
+# Simulated recordings with known effects, on which the diagnosis is calibrated.
 
 Values = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value
 
@@ -49,7 +49,7 @@ def performed(
     effects: Values,
     operator: OperatorSettings | None = None,
 ) -> list[SimulatedTrial]:
-    """Simulated trials in a scene changed by those effects that change scenes (one scene for all)."""
+    """Simulate trials in the scene as these effects change it (one scene for all)."""
     hand, around, _ = scene_of(rig, {}, effects)
     blocks = [scene_of(rig, each, effects)[2] for each in blocks]
     for grip in (effect_named(name).grip for name in effects):
@@ -59,7 +59,7 @@ def performed(
 
 
 def scene_of(rig: Rig, blocks: Blocks, effects: Values) -> tuple[Rig, Surroundings, Blocks]:
-    """Hand, surroundings and blocks as those effects make them that change scenes."""
+    """Hand, surroundings and blocks as these effects change them."""
     scene: dict[str, float] = {}
     for name, values in effects.items():
         change = effect_named(name).scene
@@ -81,7 +81,12 @@ def recorded(
 ) -> Trial:
     """What the nominal hand's sensors record of a simulated trial under the given effects.
 
-    `change` is one more, of the caller's own, that acts on what the sensors would see.
+    Args:
+        simulated: The trial.
+        task: The task.
+        rig: The nominal hand.
+        effects: Parameters of each effect.
+        change: A further change of what the sensors see.
     """
     rng = np.random.default_rng([simulated.seed, 7])
     motion = simulated.motion
@@ -126,7 +131,7 @@ def altered(truth: Performance, effects: Values, rng: np.random.Generator) -> Pe
 def carried(
     t: np.ndarray, boundaries: Sequence[float] | np.ndarray, task: BlockTask, blocks: Blocks
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weight [N] and width [m] of the block in the air (0 and 1 where there is none) at times `t` [s]."""
+    """Weight [N] and width [m] of the lifted block (0 and 1 where there is none) at times `t` [s]."""
     weight, width = np.zeros(t.size), np.ones(t.size)
     for m, move in enumerate(task.performed):
         leave, meet = boundaries[4 * m + 1 : 4 * m + 3]
@@ -135,10 +140,12 @@ def carried(
     return weight, width
 
 
-BATCHES = (1, 3, 4)  # numerics: twins that are simulated at once: the first alone is mostly enough
-PROMISES = 0.5  # numerics: share of what leaves doubt, below which no effect of a twin is refined
-LEAST = 1e-3  # numerics: a property below that cannot be simulated [N, m]
-QUANTILES = (0.1, 0.9)  # chosen: of what was aligned, the range that an operator's settings are drawn from
+BATCHES = (1, 3, 4)  # numerics: twins simulated at a time: the first alone usually suffices
+# numerics: share of the statistic that leaves doubt, below which no effect of a twin is refined
+PROMISES = 0.5
+LEAST = 1e-3  # numerics: N, m; smaller properties cannot be simulated
+# chosen: quantiles of the aligned trials between which an operator's settings are drawn
+QUANTILES = (0.1, 0.9)
 
 
 def twin_statistics(
@@ -148,12 +155,18 @@ def twin_statistics(
     seed: int,
     tell: Progress = silent,
 ) -> Iterator[float]:
-    """Statistics of healthy twins of a search, whose own is `value`, one by one, from the cache where they
-    are known.
+    """Statistics of healthy twins of a search, one by one; known ones are read from the cache.
 
-    What sensors' noise makes of a twin's candidates is seen only where its statistic without that, which is
-    no smaller, is a sign of a gap and leaves `value` in doubt. Where this hand or these blocks cannot be
-    simulated there are none.
+    The effect of sensor noise on a twin's candidates, which can only lower its statistic, is computed only if
+    the statistic without it is a sign of a gap and leaves `value` in doubt. There are no twins if this hand
+    or these blocks cannot be simulated.
+
+    Args:
+        found: The search.
+        value: Its own statistic [nats].
+        actual: Measured properties.
+        seed: Of the twins.
+        tell: Called with a description of each stage.
     """
     frame = found.problem.frame
     file = _file(found.trials, frame.task, frame.rig, actual, seed)
@@ -172,11 +185,11 @@ def twin_statistics(
         for k, trials in zip(which, twins, strict=True):
             if k < len(known):
                 continue
-            with suppress(InputError):  # a twin that drops its block is none
+            with suppress(InputError):  # a twin that drops its block does not count
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
                 most = healthy_statistic(twin, actual, found.identified, False, PROMISES * doubtful(value))
-                sure = most <= 0 or clear(value, most)  # what is no sign of a gap counts as nothing
+                sure = most <= 0 or clear(value, most)  # no sign of a gap counts as zero
                 known.append(most if sure else healthy_statistic(twin, actual, found.identified))
                 keep_numbers(file, known)
                 yield known[-1]
@@ -186,9 +199,9 @@ def healthy_statistic(
     aligned: AlignedTrials, actual: dict | None, identified: Identified | None = None, noisy: bool = True,
     promising: float = 0.0,
 ) -> float:  # fmt: skip
-    """The statistic of one healthy recording, through the whole search; its blocks as `identified`.
+    """The statistic of one healthy recording, from the whole search with its blocks as `identified`.
 
-    Effects are refined where a linear step gains as much as is `promising` [nats].
+    Effects are refined where a linear step gains as much as is `promising` [nats]; `noisy` as in `search`.
     """
     promising = max(promising, PROMISING)
     f = forms(search(aligned, actual, identified=identified, noisy=noisy, promising=promising).gap)
@@ -196,7 +209,7 @@ def healthy_statistic(
 
 
 def own_healthy(found: Search, healthy: AlignedTrials, actual: dict | None) -> Iterator[float]:
-    """The statistics of a user's own healthy recordings, as many trials at a time as were diagnosed."""
+    """Statistics of a user's own healthy recordings, in groups as large as the diagnosed one."""
     every = healthy.trials
     size = min(found.problem.frame.num_trials, len(every))
     for start in range(0, len(every) - size + 1, size):
@@ -204,16 +217,16 @@ def own_healthy(found: Search, healthy: AlignedTrials, actual: dict | None) -> I
 
 
 def _recorded(found: Search, which: range, seed: int) -> list[list[Trial]]:
-    """Recordings of as many trials each as were searched."""
+    """Recordings of twins, each with as many trials as were searched."""
     frame, blocks = found.problem.frame, blocks_of(found)
     trials, task, rig = frame.num_trials, frame.task, frame.rig
-    hand = rig.model_copy(update={"rate": _rate(found.trials)})
+    hand = rig.model_copy(update={"rate": float(np.median([trial.rate for trial in found.trials]))})
     seeds = [seed + 7_000_000 + 1000 * k + j for k in which for j in range(trials)]
     every = [blocks] * len(seeds)
     simulated = None
-    with suppress(ValueError):  # motion that cannot be smoothed, as its noise is not stated
+    with suppress(ValueError):  # motion cannot be smoothed without stated noise
         simulated = simulate_plans(task, hand, _plans(found, task, rig, blocks) * len(which), every, seeds)
-    # Repeated motions may drop blocks, or never reach them.
+    # Repeated motions may drop blocks or never reach them.
     if simulated is None or not all(np.isfinite(s.boundaries).all() for s in simulated):
         simulated = performed(task, hand, every, seeds, {}, settings(found))
     twins = [recorded(s, task, hand, {}) for s in simulated]
@@ -223,7 +236,7 @@ def _recorded(found: Search, which: range, seed: int) -> list[list[Trial]]:
 
 
 def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -> list[Plan]:
-    """Commands for the recorded motions of every trial, as quick as a hand commands."""
+    """Commands that repeat the recorded motions of every trial, as fast as a hand is commanded."""
     out = []
     for trial, a in zip(found.trials, found.aligned.trials, strict=True):
         small, group = thinned(trial, rig, 1 / QUICKEST)
@@ -236,9 +249,12 @@ def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -
 
 
 def blocks_of(found: Search) -> dict[str, Block]:
-    """The blocks as measured, else as identified; ValueError where one cannot be.
+    """The blocks as measured, else as identified.
 
-    A twin is healthy: what was measured is right of it, so that a wrong measurement shows as a gap.
+    A healthy twin agrees with the measurement, so that a wrong measurement shows as a gap.
+
+    Raises:
+        ValueError: A property is too small to be simulated.
     """
     given = found.problem
     values = np.where(given.measured, given.centre, found.blocks[0])
@@ -248,7 +264,7 @@ def blocks_of(found: Search) -> dict[str, Block]:
 
 
 def settings(found: Search) -> OperatorSettings:
-    """An operator who works at the pace, and grips as hard, as was recorded."""
+    """An operator who works at the recorded pace and grips as hard as was recorded."""
     frame = found.problem.frame
     usual, arrays, world = OperatorSettings(), frame.arrays, frame.world
     grip, spans = [], dict[str, list[float]]()
@@ -276,18 +292,14 @@ def settings(found: Search) -> OperatorSettings:
 
 
 def _carrying(usual: OperatorSettings) -> float:
-    """How long a carry usually lasts [s]."""
+    """Usual duration of a carry [s]."""
     return float(
         np.mean(usual.lift) + np.mean(usual.travel) + np.mean(usual.descend) + 2 * np.mean(usual.air)
     )
 
 
-def _rate(trials: Sequence[Trial]) -> float:
-    return float(np.median([trial.rate for trial in trials]))
-
-
 def _file(trials: Sequence[Trial], task: BlockTask, rig: Rig, actual: dict | None, seed: int) -> Path | None:
-    """Where statistics are kept: by recordings, task, rig, measurements, seed and the code that made them."""
+    """The cache file of statistics, keyed by recordings, task, rig, measurements, seed and source code."""
     digest = hashlib.sha256()
     for trial in trials:
         for name, values in sorted({"t": trial.t, **trial.channels}.items()):

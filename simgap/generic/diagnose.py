@@ -229,7 +229,7 @@ def gap_of(
     )  # fmt: skip
     residual = ((real - sim.mean(0)) @ white.root.T).ravel()
     return Gap(parts, residual, np.zeros((residual.size, 0)), tuple(candidates),
-               told=np.tile(white.expected, count))  # fmt: skip
+               mean_square=np.tile(white.expected, count))  # fmt: skip
 
 
 @dataclass(frozen=True)

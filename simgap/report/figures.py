@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
-from simgap.gap.diagnose import Diagnosis
+from simgap.gap.diagnose import Diagnosis, channels
 from simgap.generic.diagnose import GenericDiagnosis
 from simgap.report.finding import CHANNELS, by_place, chances, plain_name, share_of
 from simgap.report.robot import Course, Own, courses, residuals
@@ -110,17 +110,11 @@ def _unit(channel: str) -> tuple[float, str]:
 
 
 def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
-    """A recorded signal in task space (T,), SI units."""
-    from simgap.effects.base import tips
-
+    """A recorded signal in task space (T,), SI units; as grip the lesser of the two fingers' forces."""
     world = found.problem.frame.world
-    (x1, y1, x2, y2), (vx1, vy1, vx2, vy2) = (each[trial].T for each in tips(world))
-    fx1, fy1, fx2, fy2 = world.force[trial].T
-    return {
-        "x": (x1 + x2) / 2, "y": (y1 + y2) / 2, "distance": x2 - x1, "offset": y2 - y1,
-        "vx": (vx1 + vx2) / 2, "vy": (vy1 + vy2) / 2, "fx": fx1 + fx2, "fy": fy1 + fy2,
-        "grip": np.minimum(fx1, -fx2), "shear": (fy1 - fy2) / 2,
-    }[channel]  # fmt: skip
+    if channel == "grip":
+        return np.minimum(world.force[trial, :, 0], -world.force[trial, :, 2])
+    return channels(world)[trial, :, list(CHANNELS).index(channel)]
 
 
 def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
@@ -134,21 +128,25 @@ def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
 def _draw_trial(found: Diagnosis, path: Path) -> None:
     """Draw channel and trial of the largest excess: recorded, simulated, corrected."""
     frame = found.problem.frame
-    cell = max(found.cells, key=lambda c: c.energy - c.count)
-    r, c, n = cell.trial, list(CHANNELS).index(cell.channel), frame.lengths[cell.trial]
-    t, there = frame.world.t[r, :n], found.problem.whitening.weight[r, :n, c] > 0
+    there = found.problem.there.astype(float)
+    own = np.eye(len(frame.steps))[frame.arrays.subtask]
+    square, count = (np.einsum("rns,rnc->rsc", own, there * z) for z in (found.before**2, 1.0))
+    excess = np.where(count > 0, square - count, -np.inf)
+    r, subtask, c = (int(k) for k in np.unravel_index(excess.argmax(), excess.shape))
+    channel, n = list(CHANNELS)[c], frame.lengths[r]
+    t, there = frame.world.t[r, :n], found.problem.there[r, :n, c]
     with canvas(path, height=3.4) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
-        factor, label = _unit(cell.channel)
-        recorded = _recorded(found, r, cell.channel)[:n]
+        factor, label = _unit(channel)
+        recorded = _recorded(found, r, channel)[:n]
         above.plot(t, factor * recorded, color="black", lw=1.2, label="recorded")
-        off = found.problem.whitening.weight[r, :n, c]
+        off = found.problem.weight[r, :n, c]
         for residual, colour, name in ((found.before, RED, "simulated"), (found.after, BLUE, "corrected")):
             left = np.divide(residual[r, :n, c], off, out=np.full(n, np.nan), where=off > 0)
             above.plot(t, factor * (recorded - left), ".", color=colour, ms=2, label=name)
         above.set_ylabel(label)
         above.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3)
-        inside = t[frame.arrays.subtask[r, :n] == cell.subtask]
+        inside = t[frame.arrays.subtask[r, :n] == subtask]
         for axes in (above, below):
             for event in frame.world.events[r]:
                 axes.axvline(event, color=GREY, lw=0.5)
@@ -157,7 +155,7 @@ def _draw_trial(found: Diagnosis, path: Path) -> None:
         below.plot(t[there], found.after[r, :n, c][there], ".", color=BLUE, ms=3)
         below.set_yscale("symlog", linthresh=3)
         below.set(xlabel="time [s]", ylabel="residual [sd]")
-        above.set_title(f"{cell.channel} in {frame.files[r]}, largest gap shaded", loc="left")
+        above.set_title(f"{channel} in {frame.files[r]}, largest gap shaded", loc="left")
 
 
 def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:

@@ -15,7 +15,7 @@ from simgap.gap import assemble
 from simgap.gap.assemble import SIZES, carried, gap_of, noise_gained, on_other, redrawn
 from simgap.gap.frame import build, without_dropouts
 from simgap.gap.nuisances import with_nuisances
-from simgap.gap.problem import Start, fit, neutral, problem
+from simgap.gap.problem import fit, neutral, problem
 
 GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
 
@@ -103,11 +103,11 @@ def given():
 
 @double_precision
 def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_by(given):
-    healthy = fit(given, Start((), neutral(given)))
+    healthy = fit(given, (), neutral(given))
     noise = carried(
         healthy.residual[:, None], redrawn(given), lambda other: on_other(other, healthy).residual[:, None]
     )
-    there, arrays = given.whitening.weight > 0, given.frame.arrays
+    there, arrays = given.there, given.frame.arrays
     channel, doubted = np.nonzero(there)[2], (arrays.sd / arrays.plain)[there]
     square = np.square(noise[..., 0] * doubted).mean(0)
     for c in range(1, 10):  # of sensors alone, what is in doubt besides left out; x has its grips' mean taken
@@ -116,12 +116,12 @@ def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_b
 
 @double_precision
 def test_pads_that_swallow_noise_gain_what_they_swallow(given):
-    healthy = fit(given, Start((), neutral(given)))
-    stiff = fit(given, Start(("fingertip_compliance",), healthy.u), 0)
+    healthy = fit(given, (), neutral(given))
+    stiff = fit(given, ("fingertip_compliance",), healthy.u, 0)
     u = stiff.u.copy()
     own = stiff.columns[given.num_properties :]
     u[own[-1]] -= 2.0  # stiffer in shear by two usual deviations
-    stiff = fit(given, Start(("fingertip_compliance",), u), 0)
+    stiff = fit(given, ("fingertip_compliance",), u, 0)
     others = redrawn(given)
     assert noise_gained(others, healthy, stiff) > 1.0
     assert noise_gained(others, healthy, healthy) == 0.0
@@ -131,7 +131,7 @@ def test_pads_that_swallow_noise_gain_what_they_swallow(given):
 @pytest.mark.parametrize("shown", [0.9999, 1.0001])
 def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(given, shown, monkeypatch):
     """The most visible one is hardly a candidate, or the least visible one just is."""
-    healthy = fit(given, Start((), neutral(given)))
+    healthy = fit(given, (), neutral(given))
     measured = replace(given, measured=np.ones_like(given.measured))
     size = [np.square(c.jacobian * c.scale).sum() for c in assemble._measured(measured, healthy)]
     monkeypatch.setattr(assemble, "SHOWN", (min(size) if shown > 1 else max(size)) / shown)

@@ -8,9 +8,9 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.gap.assemble import scatters
 from simgap.gap.frame import CHANNELS, _struck, build
-from simgap.gap.problem import Start, fit, neutral, problem, residual_at
+from simgap.gap.problem import fit, neutral, problem, residual_at
 from simgap.gap.residuals import fivepoint
-from simgap.gap.sensor_noise import kinks, of_a_kink, pushed, speed_jumps
+from simgap.gap.sensor_noise import changes, kinks, of_a_kink, speed_jumps
 from simgap.gap.twins import performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
@@ -30,7 +30,7 @@ def trials(effects, operator=None):
 def fast():
     """The problem of healthy work twice as fast as usual, and its fit."""
     given = problem(build(align(trials({}, TWICE), TASK, RIG)))
-    return given, fit(given, Start((), neutral(given)))
+    return given, fit(given, (), neutral(given))
 
 
 @double_precision
@@ -49,7 +49,7 @@ def test_fast_work_leaves_little_but_noise_away_from_contact_changes(fast, chann
     # touchdown much more is left still (docs/gap.md).
     given, healthy = fast
     z, c = residual_at(given, (), healthy.u), CHANNELS.index(channel)
-    mine = (given.whitening.weight[..., c] > 0) & (given.frame.arrays.kind == 2 * phase)
+    mine = given.there[..., c] & (given.frame.arrays.kind == 2 * phase)
     assert (z[..., c][mine] ** 2).mean() < most
 
 
@@ -112,7 +112,7 @@ def test_noise_and_smooth_motion_have_no_kinks():
 
 def test_what_fingers_push_does_not_rest():
     place = np.where(np.arange(40) < 20, 0.0, 2e-3)
-    push = pushed(place, np.full(40, 2e-5))
+    push = changes(place, np.full(40, 2e-5))
     assert push[19] == push[20] == pytest.approx(2e-3, rel=0.05)
     assert np.count_nonzero(push) == 2
 

@@ -14,7 +14,7 @@ from simgap.effects import effect_named
 from simgap.gap.assemble import after, gap_of, rows_of, scatters, together
 from simgap.gap.frame import CHANNELS, build
 from simgap.gap.nuisances import with_nuisances
-from simgap.gap.problem import Start, derivatives, fit, neutral, problem, slots
+from simgap.gap.problem import derivatives, fit, neutral, problem, slots
 
 
 def read(name):
@@ -32,7 +32,7 @@ def own(given, found, name):
 @pytest.fixture(scope="module")
 def healthy():
     given = problem(read("none_1"))
-    return given, double_precision(fit)(given, Start((), neutral(given)))
+    return given, double_precision(fit)(given, (), neutral(given))
 
 
 @double_precision
@@ -44,7 +44,7 @@ def test_a_healthy_recording_is_noise(healthy):
 @double_precision
 def test_no_force_bias_is_found_in_a_healthy_recording(healthy):
     given, _ = healthy
-    biased = fit(given, Start(("force_bias",), neutral(given)))
+    biased = fit(given, ("force_bias",), neutral(given))
     assert max(abs(v) for v in own(given, biased, "force_bias").values()) < 0.005
 
 
@@ -53,7 +53,7 @@ def test_a_force_bias_is_recovered():
     given = problem(read("force_bias_1"))
     labels = json.loads((RECORDINGS / "labels.json").read_text())
     truth = next(e for e in labels if e["case"] == "force_bias_1")["params"]["bias"]
-    plain, biased = (fit(given, Start(e, neutral(given))) for e in ((), ("force_bias",)))
+    plain, biased = (fit(given, e, neutral(given)) for e in ((), ("force_bias",)))
     np.testing.assert_allclose(list(own(given, biased, "force_bias").values()), truth, atol=0.004)
     assert plain.cost - biased.cost > 1000
 
@@ -61,14 +61,14 @@ def test_a_force_bias_is_recovered():
 @double_precision
 def test_a_gain_cannot_win_by_scaling_the_noise(healthy):
     given, found = healthy
-    scaled = fit(given, Start(("force_gain",), neutral(given)))
+    scaled = fit(given, ("force_gain",), neutral(given))
     assert found.cost - scaled.cost < 8
 
 
 @double_precision
 def test_a_form_has_its_own_parameters_free(healthy):
     given, _ = healthy
-    one = fit(given, Start(("force_gain/1",), neutral(given)), steps=1)
+    one = fit(given, ("force_gain/1",), neutral(given), steps=1)
     values = own(given, one, "force_gain")
     assert values["gain"] == 0 and values["fx1"] == 0 and values["finger1"] != 0
 
@@ -77,7 +77,7 @@ def test_a_form_has_its_own_parameters_free(healthy):
 def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
     given, plain = healthy
     names = ("force_bias", "table_tilt")
-    joint = fit(given, Start(names, neutral(given)))
+    joint = fit(given, names, neutral(given))
     gap = together(given, gap_of(given, plain, []), plain, joint)
     assert [c.name for c in gap.candidates] == list(names)
     left = gap.residual - gap.nuisance[:, : given.num_properties] @ joint.u[: given.num_properties]
@@ -89,9 +89,9 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
 def test_an_effect_fitted_after_another_adds_to_it_what_both_take_off(healthy):
     frame = healthy[0].frame
     given = problem(replace(frame, world=frame.world._replace(give_normal=0.5 * frame.world.give_normal)))
-    plain = fit(given, Start((), neutral(given)))
-    first = fit(given, Start(("fingertip_compliance",), plain.u))
-    joint = fit(given, Start((*first.effects, "link_length"), first.u))
+    plain = fit(given, (), neutral(given))
+    first = fit(given, ("fingertip_compliance",), plain.u)
+    joint = fit(given, (*first.effects, "link_length"), first.u)
     gap = after(given, gap_of(given, plain, [first]), plain, first, [joint], ())
     one, other = gap.candidates
     assert (one.name, other.name) == ("fingertip_compliance", "link_length")

@@ -48,7 +48,7 @@ def given():
 
 
 def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
-    there = given.whitening.weight > 0
+    there = given.there
     trial, sample, channel = np.nonzero(there)
     rows = Rows(trial, channel, given.frame.arrays.subtask[trial, sample], given.frame.world.t[trial, sample],
                 given.frame.files, CHANNELS, tuple(map(str, range(len(given.frame.steps)))))  # fmt: skip
@@ -63,7 +63,7 @@ def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
 
 @double_precision
 def test_blocks_turn_and_settle_in_the_offset_and_height_alone(given):
-    there = given.whitening.weight > 0
+    there = given.there
     channel = np.nonzero(there)[2]
     carried = np.broadcast_to(given.frame.arrays.phase[..., 2:3] > 0, there.shape)[there]
     turning, settling = _turning(given), _settling(given)
@@ -91,8 +91,8 @@ def test_columns_of_late_speeds_hold_no_noise_of_the_speeds(given):
 
 @double_precision
 def test_a_block_that_turns_frees_all_but_where_it_stands(given):
-    free = np.zeros(given.whitening.weight.shape)
-    there = given.whitening.weight > 0
+    free = np.zeros(given.weight.shape)
+    there = given.there
     free[there] = turned_variance(given, 0.02)
     phase = given.frame.arrays.phase
     for c, name in enumerate(CHANNELS):
@@ -110,7 +110,7 @@ def test_a_block_that_turns_frees_all_but_where_it_stands(given):
 @double_precision
 def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_no_weight(given):
     a, (column,) = given.frame.arrays, _inertial(given)
-    there, free = given.whitening.weight > 0, a.phase[..., Phase.FREE] > 0
+    there, free = given.there, a.phase[..., Phase.FREE] > 0
     world = given.frame.world
     acceleration = np.asarray(gradient(world.t, tips(world)[1]))
     net = BEYOND * (acceleration[..., :2] + acceleration[..., 2:])
@@ -120,7 +120,7 @@ def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_
         c = CHANNELS.index(name)
         mine = there[..., c] & free
         assert mine.sum() > 100
-        expected = (net[..., k] * given.whitening.weight[..., c])[mine]
+        expected = (net[..., k] * given.weight[..., c])[mine]
         np.testing.assert_allclose(out[..., c][mine], expected, atol=0.02 * np.abs(expected).max())
 
 

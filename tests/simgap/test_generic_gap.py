@@ -64,7 +64,7 @@ def test_whitened_rows_of_alike_trials_have_the_squares_that_are_stated():
         features = both(lay)
         gap = gap_of(lay, whitening(scene(lay), *features), *features, ())
         squares.append([(gap.residual**2)[gap.rows.channel == c].sum() for c in range(5)])
-        stated.append([gap.told[gap.rows.channel == c].sum() for c in range(5)])
+        stated.append([gap.mean_square[gap.rows.channel == c].sum() for c in range(5)])
     np.testing.assert_allclose(np.sum(squares, 0) / np.sum(stated, 0), 1.0, atol=0.3)
 
 

@@ -9,7 +9,7 @@ from hmmseg.errors import InputError
 from hmmseg.segmentation.align import align
 from simgap.api import diagnose
 from simgap.gap.frame import build
-from simgap.gap.problem import Start, fit, neutral, problem
+from simgap.gap.problem import fit, neutral, problem
 from simgap.world.properties import Block
 from simgap.world.simulate import simulate_trials
 
@@ -33,7 +33,7 @@ def test_properties_without_an_effect_are_those_identified(source):
     aligned = source()
     found = identify_aligned(aligned)
     given = problem(build(aligned))
-    healthy = fit(given, Start((), neutral(given)))
+    healthy = fit(given, (), neutral(given))
     values = given.centre + given.sd * healthy.u[: given.num_properties].reshape(-1, 3)
     assert len(found.names) == 6
     for obj, prop in found.names:
