@@ -1,9 +1,9 @@
 """The diagnosis in open labs: false alarms, single effects, pairs, effects from outside, default flags.
 
-    python -m experiments.gap_drawn FOLDER --results DIR --run NAME [--cases CASE ...] [--output FILE.json]
+    python -m experiments.gap_drawn FOLDER ... --results DIR --run NAME [--output FILE.json]
 
-FOLDER holds cases with labels.json next to them: those of another simulator, or those that
-`python -m experiments.blind_check open` draws. Diagnoses go to DIR/CASE.json, so that a run may be
+A FOLDER holds cases with labels.json next to them: those of another simulator, or those that
+`python -m experiments.blind_check open` draws. Diagnoses go to DIR/FOLDER/CASE.json, so that a run may be
 stopped and started again, and the rows of this run stand under NAME in FILE.json
 (experiments/results/gap_labs.json), next to those of other code. Nothing is sealed: what is changed by what
 comes out is judged on other cases.
@@ -154,25 +154,26 @@ def table(found: dict[str, Any]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Rows of one run over open labs, `cases` that are not there yet diagnosed first, and of the same cases
+    """Rows of one run over open labs, cases that are not there yet diagnosed first, and of the same cases
     what labels say of other code (`said_by_COMMIT`)."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", type=Path)
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--results", type=Path, required=True)
     parser.add_argument("--run", required=True)
-    parser.add_argument("--cases", nargs="+")
     parser.add_argument("--output", type=Path, default=RESULT)
     options = parser.parse_args(arguments)
-    labels = json.loads((options.folder / "labels.json").read_text(encoding="utf-8"))
-    options.results.mkdir(parents=True, exist_ok=True)
+    cases: list[tuple[Path, dict[str, Any]]] = []
+    for folder in options.folders:
+        (options.results / folder.name).mkdir(parents=True, exist_ok=True)
+        labels = json.loads((folder / "labels.json").read_text(encoding="utf-8"))
+        cases += [(folder, label) for label in labels]
     runs: dict[str, list[dict[str, Any]]] = {}
-    for label in labels:
-        folder, file = options.folder / label["case"], options.results / f"{label['case']}.json"
-        wanted = (folder / "rig.toml").exists() and (options.cases is None or label["case"] in options.cases)
-        if not file.exists() and wanted:
-            file.write_text(json.dumps(diagnose_folder(folder)) + "\n", encoding="utf-8")
-        if not file.exists():
+    for folder, label in cases:
+        case, file = folder / label["case"], options.results / folder.name / f"{label['case']}.json"
+        if not (case / "rig.toml").exists():
             continue
+        if not file.exists():
+            file.write_text(json.dumps(diagnose_folder(case)) + "\n", encoding="utf-8")
         for key in (k for k in label if k.startswith("said_by_")):
             said = label[key]
             body = {"error": "", "seconds": 0.0}

@@ -239,7 +239,7 @@ class Search:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
                 before = one.score
-                if one.promise < max(before + BETTER, rival - NEAR):
+                if one.promise < before + BETTER:
                     break
                 there = self.composed.moved(one.point)
                 again = self._judge(there, names, self._fit_point(there, one.point, one.whiten))
