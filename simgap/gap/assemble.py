@@ -305,13 +305,12 @@ def gap_of(
     seen = {c.parameters for c in measured if np.square(c.jacobian * c.scale).sum() > SHOWN}
 
     def at(problem: Problem, healthy: Fitted, fits: Sequence[Fitted]) -> Gap:
-        k = problem.num_properties
-        start = healthy.residual - healthy.jacobian @ healthy.u[:k]
         nuisance = np.concatenate([-healthy.jacobian, problem.nuisances.columns], 1)
-        shifting = [_shifting(problem, f, start, healthy.jacobian, healthy.doubts) for f in fits]
+        shifting = [_shifting(problem, f, healthy) for f in fits]
         measured = [c for c in _measured(problem, healthy) if c.parameters in seen]
         every = (*shifting, *scattering, *measured)
-        return Gap(rows, start, nuisance, every, tolerance=tolerance, usual=usual)
+        residual = _at_nominal(healthy, healthy)
+        return Gap(rows, residual, nuisance, every, tolerance=tolerance, usual=usual)
 
     gap = at(given, healthy, fits)
     if not redrawn:
@@ -387,14 +386,12 @@ def after(
     """
 
     def of(problem: Problem, healthy: Fitted, first: Fitted, joint: Sequence[Fitted]) -> Gap:
-        k, own = problem.num_properties, []
-        start = healthy.residual - healthy.jacobian @ healthy.u[:k]
-        one = _shifting(problem, first, start, healthy.jacobian, healthy.doubts)
+        one, own = _shifting(problem, first, healthy), []
         for f in joint:
-            both = start - (f.residual - healthy.jacobian @ f.u[:k])
-            known = one.shift + one.jacobian @ (f.u[first.columns[k:]] - one.at)
+            both = _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
+            by_first = one.shift + one.jacobian @ (f.u[first.columns[problem.num_properties :]] - one.at)
             mine = slice(first.columns.size, None)
-            own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - known,
+            own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - by_first,
                                   f.jacobian[:, mine], f.doubts - first.doubts))  # fmt: skip
         return replace(gap, candidates=(*gap.candidates, *own))
 
@@ -433,14 +430,16 @@ def _turning(given: Problem, angle: float) -> np.ndarray:
     return np.square(size[there]) * (stands & (distance | offset | (y & ~mean)))
 
 
-def _shifting(given: Problem, f: Fitted, start: np.ndarray, jacobian: np.ndarray, usual: float) -> Candidate:
-    """A fit as a candidate: its shift at the properties' own nominal values.
+def _at_nominal(f: Fitted, healthy: Fitted) -> np.ndarray:
+    """The residual (n,) of a fit with properties at their nominal values, to first order."""
+    return f.residual - healthy.jacobian @ f.u[: healthy.columns.size]
 
-    `usual` is the cost of doubts without the effect [nats].
-    """
-    k = given.num_properties
-    shift = start - (f.residual - jacobian @ f.u[:k])
-    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.jacobian[:, k:], f.doubts - usual)
+
+def _shifting(given: Problem, f: Fitted, healthy: Fitted) -> Candidate:
+    """A fit of one effect as a candidate: its shift with properties at their nominal values."""
+    k, shift = given.num_properties, _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
+    doubts = f.doubts - healthy.doubts
+    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.jacobian[:, k:], doubts)
 
 
 def _candidate(
