@@ -110,7 +110,10 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
 
     `prior`: mean and sd of the compliance of a pad [m/N], which is profiled.
     """
-    squeezes = squeezes[:: max(1, len(squeezes) // ENOUGH)]
+    some = squeezes[:: max(1, len(squeezes) // ENOUGH)]
+    squeezes = [
+        s for s in some if np.quantile(np.nan_to_num(s.load), FIRMEST) >= 0
+    ]  # misread forces may pull
     if not squeezes:
         return Lateness()
     compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED

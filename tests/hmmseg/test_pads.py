@@ -67,6 +67,12 @@ def test_releases_of_grips_that_ring_are_not_early():
     assert np.abs(ends - judged.boundaries)[3::4].max() < 0.02  # 26 and 37 ms with pads taken to be rigid
 
 
+def test_holds_in_which_misread_forces_pull_say_nothing_of_a_delay():
+    t = np.arange(0.0, 0.8, 0.02)
+    pulls = Squeeze(t, np.full(t.size, 0.02), np.zeros(t.size), -1.0 - 0.1 * t, 2e-5, 0.01)
+    assert lateness([pulls], PRIOR) == Lateness()
+
+
 @pytest.mark.parametrize("shift", [-0.003, 0.003])
 def test_a_small_delay_leaves_both_ends_of_a_contact(shift):
     s = squeeze()
