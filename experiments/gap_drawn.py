@@ -126,7 +126,7 @@ def table(found: dict[str, Any]) -> str:
     lines = [
         line("healthy: none", ["healthy"], "quiet"),
         line("single: named alone", ["single"], "named"),
-        line("single: named alone, or in a set", ["single"], "named", "set"),
+        line("single: in a set", ["single"], "set"),
         line("single: named with others", ["single"], "beside others"),
         line("single: unknown", ["single"], "unknown"),
         line("single: not noticed, or too small to matter", ["single"], "missed", "too small"),

@@ -32,9 +32,9 @@ def minute(found: dict) -> str:
     rows = [["in one go", f"{whole['processor']:.0f} s", f"{whole['wall']:.0f} s"]]
     note = (
         f"A log of {found['seconds']:.0f} s at {found['rate']:.0f} Hz of six joints; {found['cores']} cores, "
-        f"on which on average {found['load'][1]:.0f} processes ran, these among them. Planted: "
-        f"{' and '.join(found['planted'])}. Verdict: {found['found']['verdict']}, "
-        f"{' + '.join(found['found']['causes']) or 'no cause'}."
+        f"{found['load'][1]:.0f} processes on average. Planted: {' and '.join(found['planted'])}. Verdict: "
+        f"{found['found']['verdict']}, {' + '.join(found['found']['causes']) or 'no cause'}"
+        f"{''.join(f' or {n}' for n in found['found']['indistinguishable'])}."
     )
     return f"{markdown(['', 'processor', 'time'], rows)}\n\n{note}"
 
