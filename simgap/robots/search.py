@@ -239,7 +239,7 @@ class Search:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
                 before = one.score
-                if one.promise < before + BETTER:
+                if one.promise < max(before + BETTER, rival - NEAR):
                     break
                 there = self.composed.moved(one.point)
                 again = self._judge(there, names, self._fit_point(there, one.point, one.whiten))
@@ -417,15 +417,16 @@ class Search:
         effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
         tried, wrong, found = 0, 0.0, best
         for k in np.argsort(-promised):
-            # Two replacements are fitted whatever straight lines promise: these may miss them by more.
-            if tried >= TRIED or (promised[k] < least and (at is best or tried >= LEARNED)):
+            # Two replacements are fitted to the end whatever straight lines promise: these may miss by more.
+            learns = at is not best and tried < LEARNED
+            if tried >= TRIED or (promised[k] < least and not learns):
                 break
             begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
             names = self._take_apart(near[k], begin)
             if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                 continue
             scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
-            one, tried = self.fit(names, begin, scales, best.score), tried + 1
+            one, tried = self.fit(names, begin, scales, -np.inf if learns else best.score), tried + 1
             wrong = max(wrong, one.score - best.score - promised[k])
             if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
                 least = max(least, -NEAR - wrong)
