@@ -52,11 +52,6 @@ class Background:
         ])  # fmt: skip
         return cls(grid, log_prior)
 
-    @classmethod
-    def plain(cls) -> Background:
-        """Noise exactly as stated."""
-        return cls(np.zeros(1), np.zeros(1))
-
     def tolerant(self, most: np.ndarray) -> np.ndarray:
         """Log prior (grid, G) of groups whose variance may reach `most` (G,) without it mattering."""
         inside = (self.log_phi[:, None] > NEAR_BY) & (self.log_phi[:, None] <= np.log(most))

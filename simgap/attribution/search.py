@@ -5,7 +5,7 @@ Sets within a window of the best are kept (Occam's window: Madigan & Raftery, JA
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +28,7 @@ BEAM = 5  # numerics: sets of each size that are extended
 MOST = 6  # numerics: most effects in a set
 
 
-def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> list[Model]:
+def sought(f: Forms, beam: int = BEAM) -> list[Model]:
     """Find the sets of effects within a window of the best.
 
     The neighbours of a set are screened from its mode in one step, the leading ones refined in a few, and
@@ -38,18 +38,18 @@ def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> li
     Args:
         f: Quadratic forms of the gap.
         beam: Number of sets in the window that are extended.
-        among: Candidates to choose from; None for all.
 
     Returns:
         The sets, best first; the empty set is always one of them.
     """
-    among = list(range(len(f.gap.candidates)) if among is None else among)
-    seen: dict[tuple[int, ...], Model] = {(): fitted(f, ()), **{(j,): fitted(f, (j,)) for j in among}}
+    seen: dict[tuple[int, ...], Model] = {(): fitted(f, ())}
+    seen |= {(j,): fitted(f, (j,)) for j in range(len(f.gap.candidates))}
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}
     # The effect that leaves the least squares may be the larger of two causes although others score higher as
     # long as the smaller one is unexplained: a background that is off everywhere costs little.
-    alone = min((seen[(j,)] for j in among), key=lambda m: float(m.energy.sum()), default=seen[()])
+    singles = [m for m in seen.values() if m.effects]
+    alone = min(singles, key=lambda m: float(m.energy.sum()), default=seen[()])
     while True:
         best = max(m.score for m in seen.values())
         ranked = sorted(seen.values(), key=lambda m: -m.score)
@@ -60,7 +60,7 @@ def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> li
             break
         for m in todo:
             opened.add(m.effects)
-            new = [e for e in _neighbours(f, m.effects, among) if e not in seen and e not in rough]
+            new = [e for e in _neighbours(f, m.effects) if e not in seen and e not in rough]
             likely = [new[k] for k in np.argsort(-screened(f, m, new), kind="stable")[:SHORT]]
             found = [mode(f, quadratic_forms(f, e), m.precision, steps=SCREEN) for e in likely]
             first = sorted(found, key=lambda m: -m.score)[:REFINED]
@@ -74,14 +74,14 @@ def sought(f: Forms, beam: int = BEAM, among: Sequence[int] | None = None) -> li
     return list(kept.values())
 
 
-def _neighbours(f: Forms, effects: tuple[int, ...], among: list[int]) -> list[tuple[int, ...]]:
+def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
     """Sets with one effect added, removed or exchanged; only one form of an effect acts."""
     names = [c.name for c in f.gap.candidates]
     fewer = [tuple(j for j in effects if j != out) for out in effects]
     more = [
         tuple(sorted({*e, j}))
         for e in (effects, *fewer)
-        for j in among
+        for j in range(len(names))
         if j not in effects and names[j] not in {names[i] for i in e}
     ]
     return list(dict.fromkeys([*more, *fewer]))

@@ -23,6 +23,8 @@ from simgap.attribution.verdict import (
     significant,
 )
 
+PLAIN = Background(np.zeros(1), np.zeros(1))  # noise exactly as stated
+
 
 def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
     """Rows of a small recording at 20 Hz, every cell with as many samples."""
@@ -101,7 +103,7 @@ def enumerated(gap: Gap) -> dict[tuple[int, ...], float]:
 def test_sets_are_weighed_as_enumeration_does():
     gap = gap_of({0: 1.5, 2: 0.8})
     exact = enumerated(gap)
-    found = {m.effects: m.score for m in sought(forms(gap, Background.plain()))}
+    found = {m.effects: m.score for m in sought(forms(gap, PLAIN))}
     for effects, value in exact.items():
         if value > max(exact.values()) - 8 and effects in found:
             difference = (found[effects] - found[()]) - (value - exact[()])
@@ -109,18 +111,23 @@ def test_sets_are_weighed_as_enumeration_does():
     total = np.logaddexp.reduce(list(exact.values()))
     for j in range(4):
         truth = sum(np.exp(v - total) for e, v in exact.items() if j in e)
-        models = sought(forms(gap, Background.plain()))
+        models = sought(forms(gap, PLAIN))
         told = sum(w for m, w in zip(models, weights(models), strict=True) if j in m.effects)
         assert told == pytest.approx(truth, abs=0.06)
 
 
-def test_a_search_among_some_candidates_scores_as_one_among_all():
-    f = forms(gap_of({0: 1.5, 2: 0.8}), Background.plain())
-    every = {m.effects: m.score for m in sought(f)}
-    some = {m.effects: m.score for m in sought(f, among=(0, 3))}
-    assert {j for effects in some for j in effects} <= {0, 3} and (0,) in some
-    assert all(some[e] == pytest.approx(every[e]) for e in some.keys() & every.keys())
-    assert [c.name for c in f.gap.only((2, 0)).candidates] == [f.gap.candidates[j].name for j in (2, 0)]
+def test_some_of_the_candidates_score_as_they_do_among_all():
+    gap, some = gap_of({0: 1.5, 2: 0.8}), (0, 3)
+
+    def scores(gap: Gap) -> dict[tuple[int, ...], float]:
+        f = forms(gap, PLAIN)
+        return {m.effects: m.score - len(m.effects) * f.log_odds for m in sought(f)}
+
+    every = scores(gap)
+    few = {tuple(some[j] for j in effects): score for effects, score in scores(gap.only(some)).items()}
+    assert {j for effects in few for j in effects} <= {*some} and (0,) in few
+    assert all(few[e] == pytest.approx(every[e]) for e in few.keys() & every.keys())
+    assert [c.name for c in gap.only((2, 0)).candidates] == [gap.candidates[j].name for j in (2, 0)]
 
 
 def test_the_bayes_factor_bounds_the_chance_of_an_alarm():
