@@ -382,13 +382,16 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 def _needed(f: Forms, model: Model, effect: int) -> bool:
     """Whether an effect of a set is needed.
 
-    Its evidence must exceed RULED_OUT and what errors in the forms of the other effects may imitate. A single
-    effect is needed if there is a gap.
+    Its evidence must exceed RULED_OUT and what errors in the forms of the other effects may imitate: a share
+    of what the residuals say for the set, not of evidence from other sources. A single effect is needed if
+    there is a gap.
     """
     others = tuple(j for j in model.effects if j != effect)
     if not others:
         return True
-    feigned = max(f.gap.candidates[j].form for j in others) * (model.score - fitted(f, ()).score)
+    of = [f.gap.candidates[j] for j in others]
+    shown = model.score - fitted(f, ()).score - sum(max(c.evidence, 0.0) for c in of)
+    feigned = max(c.form for c in of) * shown
     return bool(model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned))
 
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit, gammaln
 
-from simgap.attribution.problem import Gap, Spectrum, cosines, spectrum
+from simgap.attribution.problem import Gap, Spectrum, spectrum
 from simgap.bounded import least
 
 # The background: what no candidate explains, a variance of its own for each group of rows.
@@ -121,13 +121,12 @@ def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
     linearisation: without a change of curvature every mode stays a maximum.
     """
     assert gap.carried is not None
-    rows, columns = gap.rows, gap.carried
-    out = np.zeros((int(s.group.max()) + 1, columns.shape[2], columns.shape[2]))
-    noisy = np.flatnonzero((columns != 0).any((0, 1)))
-    for draw in columns:
-        white, _ = cosines(rows, draw[:, noisy].astype(float), rows.shape)
-        out[:, noisy[:, None], noisy] += products(white, s.group) / len(columns)
-    slopes = np.ones(columns.shape[2], bool)
+    number = gap.carried.shape[2]
+    out = np.zeros((int(s.group.max()) + 1, number, number))
+    noisy = np.flatnonzero((gap.carried != 0).any((0, 1)))
+    for draw in gap.carried:
+        out[:, noisy[:, None], noisy] += products(draw[:, noisy].astype(float), s.group)
+    slopes = np.ones(number, bool)
     slopes[[0, *(mine[0] for mine in gap.own_columns)]] = False
     out[:, slopes[:, None] & slopes] = 0.0
     out[:, 0, 0] = 0.0

@@ -128,7 +128,8 @@ class Gap:
         nuisance: Derivatives (n, z) by nuisances, whose prior is N(0, 1).
         candidates: The effects that may act.
         expected: Prior mean number of effects that act.
-        carried: Draws (D, n, M) of the error that sensor noise causes in `raw_columns`.
+        carried: Errors (D, n, M) that noise of the recordings causes in the spectra of `raw_columns`; their
+            products, summed over D, are the noise's.
         tolerance: Smallest shift (n,) of each row that matters, in standard deviations of its noise.
         usual: Whether the tolerance is a default; a cause that is found then matters in any case.
         mean_square: Mean square (n,) of each row if nothing acts, less for repeats that share an error;

@@ -231,32 +231,18 @@ FORCE_LOWPASS = of_forces(
 
 # Forces rounded to a step.
 
-REPEATED = 0.5  # chosen: share of repeated values above which they lie on a lattice
 WRITTEN = 1e-5  # prior: N; resolution to which files state forces that were not rounded before
 
 
 def _scatter_quantisation(given, residual: np.ndarray):
-    """Variance from rounding, if forces repeat the levels of a lattice through zero.
+    """Variance from rounding, if forces lie on a lattice.
 
-    In files written to 1e-5 N one sample in ten repeats another's value by chance; on a lattice most do. The
-    step is the median gap between neighbouring levels, refined on all samples. Values that were not rounded
-    would all fall on such levels with a chance of WRITTEN / step each.
+    Values that were not rounded would all fall on its levels with a chance of WRITTEN / step each.
     """
     from simgap.gap.assemble import Scatter, rounded_variance
 
-    read = np.concatenate([force.ravel() for force in given.frame.forces])
-    values = read[np.isfinite(read)]
-    levels = np.unique(np.round(np.abs(values), 6))
-    if 1 - levels.size / values.size < REPEATED or levels.size < 4:
-        return None
-    step = float(np.median(np.diff(levels)))
-    for reach in (4, 16, 64, 256):  # farther levels determine the step ever more precisely
-        count = np.round(values / step)
-        near = (np.abs(count) <= reach) & (count != 0)
-        if near.any():
-            step = float(values[near] @ count[near] / (count[near] @ count[near]))
-    off = np.abs(values / step - np.round(values / step))
-    if np.mean(off < 0.1) < 0.9:
+    step = given.frame.step
+    if step == 0:
         return None
     known = float(4 * sum(given.frame.lengths) * np.log(step / WRITTEN))
     return Scatter("quantisation", step, 1e-3, rounded_variance(given, step), known)

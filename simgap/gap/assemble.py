@@ -207,11 +207,11 @@ ALIKE = 0.5  # numerics: largest difference of the two, as a share of the larger
 
 
 def redrawn(given: Problem) -> tuple[Problem, ...]:
-    """The problem with additional noise on the recordings: for each draw one with each of SIZES.
+    """The problem with other noise on the recordings: for each draw one with each of SIZES.
 
     Every number is shifted by its sensor's standard deviation, up or down. Signs of neighbouring samples and
     of neighbouring channels are orthogonal over the draws, so that squares of their combinations have their
-    expectation without scatter.
+    expectation without scatter. If forces were rounded, a last draw is without the errors that they show.
     """
     world, sensor = given.frame.world, given.frame.arrays.sensor
     place = (np.arange(world.t.shape[1])[:, None] + np.arange(4)) % len(SIGNS)
@@ -220,17 +220,18 @@ def redrawn(given: Problem) -> tuple[Problem, ...]:
         name: sensor[..., [k]] * rng.choice((-1.0, 1.0), (*world.t.shape, 4))
         for k, name in enumerate(("joints", "rates", "force"))
     }
+    draws = [{n: signs[place] * each for n, each in noise.items()} for signs in SIGNS.T]
+    draws += [{"force": -given.frame.rounding_errors}] if given.frame.step else []
     out = []
-    for signs in SIGNS.T:
+    for draw in draws:
         for size in SIZES:
-            shaken = {n: getattr(world, n) + size * signs[place] * each for n, each in noise.items()}
-            frame = replace(given.frame, world=world._replace(**shaken))
-            out.append(with_nuisances(replace(given, frame=frame)))
+            shaken = world._replace(**{n: getattr(world, n) + size * each for n, each in draw.items()})
+            out.append(with_nuisances(replace(given, frame=replace(given.frame, world=shaken))))
     return tuple(out)
 
 
 def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], np.ndarray]) -> np.ndarray:
-    """Draws (D, n, M) of the error that noise causes in columns (n, M).
+    """Errors (D, n, M) that noise causes in columns (n, M); products of noise are sums over D.
 
     Zero where it is not proportional to the noise, as next to a contact that the noise makes or breaks.
 
@@ -239,12 +240,24 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
         others: Redrawn recordings.
         on: Gives the columns on one of them.
     """
-    changes = [(on(other) - columns) / size for other, size in zip(others, SIZES * len(SIGNS.T), strict=True)]
     out = []
-    for one, other in zip(changes[::2], changes[1::2], strict=True):
+    for k, pair in enumerate(zip(others[::2], others[1::2], strict=True)):
+        one, other = ((on(each) - columns) / size for each, size in zip(pair, SIZES, strict=True))
         alike = np.abs(one - other) <= ALIKE * np.maximum(np.abs(one), np.abs(other))
-        out.append(np.where(alike, (one + other) / 2, 0.0).astype(np.float32))
+        usual = 1 / np.sqrt(len(SIGNS.T)) if k < len(SIGNS.T) else 1.0
+        out.append(np.where(alike, usual * (one + other) / 2, 0.0).astype(np.float32))
     return np.stack(out)
+
+
+def _spectra(rows: Rows, noise: np.ndarray) -> np.ndarray:
+    """Spectra of the errors of `carried`, over the noise's standard deviation.
+
+    Sensor noise was redrawn white, of the stated size; rounding is as it was.
+    """
+    out = np.empty_like(noise)
+    for k, draw in enumerate(noise):
+        out[k] = cosines(rows, draw.astype(float), rows.shape if k < len(SIGNS.T) else None)[0]
+    return out
 
 
 def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitted:
@@ -263,7 +276,7 @@ def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float
         others,
         lambda other: np.stack([on_other(other, healthy).residual, on_other(other, f).residual], 1),
     )
-    without, left = np.square(noise.astype(float)).sum(1).mean(0)
+    without, left = np.square(noise.astype(float)).sum((0, 1))
     return 0.5 * float(without - left)
 
 
@@ -320,7 +333,7 @@ def gap_of(
         plain = on_other(other, healthy)
         return at(other, plain, [on_other(other, f, plain.jacobian) for f in fits]).raw_columns
 
-    return replace(gap, carried=carried(gap.raw_columns, redrawn, on))
+    return replace(gap, carried=_spectra(rows, carried(gap.raw_columns, redrawn, on)))
 
 
 def _measured(given: Problem, healthy: Fitted) -> list[Candidate]:
@@ -409,7 +422,7 @@ def _carrying(gap: Gap, more: Gap, redrawn: Sequence[Problem], on: Callable[[Pro
         return more
     kept = gap.carried.shape[2]
     noise = carried(more.raw_columns[:, kept:], redrawn, lambda other: on(other).raw_columns[:, kept:])
-    return replace(more, carried=np.concatenate([gap.carried, noise], 2))
+    return replace(more, carried=np.concatenate([gap.carried, _spectra(gap.rows, noise)], 2))
 
 
 def _turning(given: Problem, angle: float) -> np.ndarray:

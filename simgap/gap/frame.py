@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from hmmseg.robust import bridged
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from simgap.effects import catalogue, forms_of, free_parameters
 from simgap.effects.base import World
+from simgap.gap.rounding import rounding_error, rounding_step
 from simgap.gap.sensor_noise import (
     between_samples,
     changes,
@@ -420,6 +422,20 @@ class Frame:
     def num_trials(self) -> int:
         """Number of trials."""
         return len(self.files)
+
+    @cached_property
+    def step(self) -> float:
+        """The step [N] to which forces were rounded; 0 if they were not."""
+        return rounding_step(self.forces)
+
+    @property
+    def rounding_errors(self) -> np.ndarray:
+        """The errors (T, N, 4) [N] from rounding that the forces themselves show."""
+        out = np.zeros_like(self.world.force)
+        for r, (force, group) in enumerate(zip(self.forces, self.groups, strict=True)):
+            error = grouped(rounding_error(force, self.step), group)[0]
+            out[r, : len(error)] = error
+        return out
 
 
 def build(aligned: AlignedTrials) -> Frame:

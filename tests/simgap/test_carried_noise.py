@@ -10,12 +10,13 @@ from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms, of_noise, products
-from simgap.attribution.problem import Candidate, Gap, Rows, spectrum
+from simgap.attribution.problem import Candidate, Gap, Rows, cosines, spectrum
 from simgap.gap import assemble
 from simgap.gap.assemble import SIZES, carried, gap_of, noise_gained, on_other, redrawn
 from simgap.gap.frame import build, without_dropouts
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import fit, neutral, problem
+from simgap.gap.rounding import rounding_error, rounding_step
 
 GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
 
@@ -44,7 +45,7 @@ def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
     assert columns is not None
     far, zero = np.full(1, np.inf), np.zeros(1)
     pad = Candidate("softer", ("give",), zero, zero, np.ones(1), columns[:, 1], columns[:, 2:], -far, far)
-    return Gap(rows, columns[:, 0], np.zeros((n, 0)), (pad,), carried=np.stack(draws))
+    return Gap(rows, columns[:, 0], np.zeros((n, 0)), (pad,), carried=np.stack(draws) / np.sqrt(len(draws)))
 
 
 def linearised(gap: Gap) -> Gap:
@@ -109,7 +110,7 @@ def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_b
     )
     there, arrays = given.there, given.frame.arrays
     channel, doubted = np.nonzero(there)[2], (arrays.sd / arrays.plain)[there]
-    square = np.square(noise[..., 0] * doubted).mean(0)
+    square = np.square(noise[..., 0] * doubted).sum(0)
     for c in range(1, 10):  # of sensors alone, what is in doubt besides left out; x has its grips' mean taken
         assert square[channel == c].mean() == pytest.approx(1.0, abs=0.2)
 
@@ -145,7 +146,7 @@ def test_where_noise_does_not_act_in_proportion_nothing_is_said():
     force = np.array([[0.5], [-0.9], [3.0]])
     contact = lambda step: np.maximum(force + step, 0.0)  # noqa: E731 - noise makes the second contact, at full size
     noise = carried(contact(0.0), SIZES * 2, contact)
-    np.testing.assert_allclose(noise[0][:, 0], [1.0, 0.0, 1.0])
+    np.testing.assert_allclose(np.square(noise[..., 0]).sum(0), [1.0, 0.0, 1.0], rtol=1e-6)
 
 
 def test_a_reading_lost_in_a_grip_is_missing_and_a_gap_between_two_taps_is_not():
@@ -156,3 +157,46 @@ def test_a_reading_lost_in_a_grip_is_missing_and_a_gap_between_two_taps_is_not()
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.channels["fx1"])), [4])
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.channels["fy2"])), [4])
     np.testing.assert_array_equal(found.channels["x1"], t)
+
+
+def test_rounding_shows_in_a_force_that_moves_and_not_in_one_that_rests_or_jumps():
+    t = np.arange(800) / 200
+    force = 2 + np.stack([0.5 * np.sin(2 * t), 0.2 * t, 0.06 + 0 * t, np.where(t < 2, -2.0, 0.5)], 1)
+    force += 2e-3 * np.random.default_rng(0).standard_normal(force.shape)
+    read = 0.05 * np.round(force / 0.05)
+    step = rounding_step([read[:500], read[500:]])
+    assert step == pytest.approx(0.05, rel=1e-3)
+    assert rounding_step([force]) == 0.0
+    true, shown = read - force, rounding_error(read, step)
+    left = np.std(true - shown, axis=0) / np.std(true, axis=0)
+    assert (left[:2] < 0.5).all()
+    assert np.abs(shown[:, 2:]).max() < 1e-9
+
+
+@pytest.mark.parametrize("true", [0.0, 0.5])
+def test_rounding_alone_is_no_effect_and_hides_none(true):
+    """Pads are softer by `true`; the force moves by some steps, to which it is rounded."""
+    gained, size, step = [], [], 1.0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        trial, k = np.divmod(np.arange(TRIALS * SAMPLES), SAMPLES)
+        force = 0.7 * step * np.sin(0.2 * k + 6 * rng.random(TRIALS)[trial])
+        read = step * np.round(force / step)
+        error = np.concatenate([rounding_error(read[trial == r, None], step)[:, 0] for r in range(TRIALS)])
+        sd = np.hypot(PLACE_SD, GIVE * step / np.sqrt(12))
+        left = (GIVE + true) * force + PLACE_SD * rng.standard_normal(k.size) - GIVE * read
+        nothing = np.zeros(k.size)
+        columns = np.stack([left, nothing, read], 1) / sd
+        noise = np.stack([-GIVE * error, nothing, error], 1) / sd
+        gap = softer(0.0, 1.0)
+        (pad,) = gap.candidates
+        pad = replace(pad, shift=nothing, jacobian=columns[:, 2:])
+        gap = replace(gap, residual=columns[:, 0], candidates=(pad,), carried=None)
+        fs = forms(gap), forms(replace(gap, carried=cosines(gap.rows, noise)[0][None]))
+        gained.append([fitted(f, (0,)).score - fitted(f, ()).score for f in fs])
+        size.append([fitted(f, (0,)).x[0] for f in fs])
+    (blind, told), (small, right) = np.mean(gained, axis=0), np.mean(size, axis=0)
+    if true == 0:
+        assert blind > 20 and told < 2
+    else:
+        assert abs(right - true) < 0.5 * abs(small - true)
