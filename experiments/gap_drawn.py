@@ -21,9 +21,10 @@ from experiments.blind_check.diagnose import diagnose_folder
 from experiments.blind_check.judge import intervals_hold
 from experiments.saving import save
 from experiments.table_text import markdown
-from simgap.attribution.verdict import RECORD
+from simgap.attribution.verdict import ACTED, RECORD
 
 RESULT = Path(__file__).parent / "results" / "gap_labs.json"
+SEEN = 0.01  # probability to act below which an effect is not listed
 WEAK = 0.3  # of the gap of held-out trials: causes that explain less are none
 
 
@@ -68,6 +69,10 @@ def row(label: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
         "probability": found.get("probabilities", {}).get("+".join(sorted(label["effects"])), 0.0),
         "seconds": round(found["seconds"], 1), "covered": covered(label, found),
         "confidence": confidence(found),
+        "acting": [
+            (round(one["probability"], 4), name in label["effects"])
+            for name, one in found.get("attribution", {}).items() if one["probability"] >= SEEN
+        ],
     }  # fmt: skip
 
 
@@ -89,6 +94,12 @@ def reliability(rows: Sequence[dict[str, Any]], *verdicts: str) -> str:
     if not of:
         return ""
     return f"{sum(r['confidence'] for r in of) / len(of):.2f}; {sum(map(is_right, of))} of {len(of)}"
+
+
+def acted(rows: Sequence[dict[str, Any]], least: float, most: float) -> str:
+    """Mean probability to act of effects with one from `least` to `most`, and how many do."""
+    of = [each for r in rows for each in r.get("acting", []) if least <= each[0] < most]
+    return f"{sum(p for p, _ in of) / len(of):.2f}; {sum(true for _, true in of)} of {len(of)}" if of else ""
 
 
 def record(rows: Sequence[dict[str, Any]]) -> float:
@@ -137,6 +148,8 @@ def table(found: dict[str, Any]) -> str:
         ["named with a held-out share below 0.3", *(weak(rows) for rows in runs.values())],
         ["what is named: mean probability; right", *(reliability(r, "named", "set") for r in runs.values())],
         ["none: mean probability; right", *(reliability(r, "none") for r in runs.values())],
+        ["effects likely to act: mean probability; act", *(acted(r, 0.5, 1.1) for r in runs.values())],
+        ["effects less likely to act", *(acted(r, 0.0, 0.5) for r in runs.values())],
         ["90 % intervals that hold the parameter", *(held(rows) for rows in runs.values())],
         ["seconds of processor, median",
          *(str(round(sorted(r["seconds"] for r in rows)[len(rows) // 2]) or "") for rows in runs.values())],
@@ -185,6 +198,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(*(one[k] for k in ("case", "effects", "outcome", "causes", "held_out")), flush=True)
     file = options.output
     print(f"record of what is named: {record(runs[options.run]):.2f}")
+    each = [one for r in runs[options.run] for one in r["acting"]]
+    print(f"of causes: {ACTED * sum(true for _, true in each) / sum(p for p, _ in each):.2f}")
     before = json.loads(file.read_text(encoding="utf-8"))["runs"] if file.exists() else {}
     save(file, {"runs": before | runs})
 

@@ -179,7 +179,8 @@ def verdict_on(
     rest = Remainder(left if verdict.causes else float(seen), _chance_of_noise(best), left_where)
     return RobotVerdict(
         **vars(verdict), detection=gap, remainder=rest, where=where, shares=shares, shared=best.names,
-        chance=dict.fromkeys(search.wanted, 0.0) | acting(sets, gap.p_value), over_noise=over_noise,
+        chance=dict.fromkeys(search.wanted, 0.0) | acting(sets, gap.p_value, RECORD),
+        over_noise=over_noise,
         stands_in=stands_in, doubts=doubts, explanation=best.names,
     )  # fmt: skip
 
