@@ -137,7 +137,8 @@ def noise_of(f: Forms, model: Model) -> np.ndarray:
     mean (Wilson & Hilferty, PNAS 17, 1931).
     """
     count = np.maximum(f.count, 1)
-    channel, ratio = channel_of(f), model.energy / (count * (1 - 2 / (9 * count)) ** 3)
+    energy = model.energy * np.exp(-f.shift(model.effects))
+    channel, ratio = channel_of(f), energy / (count * (1 - 2 / (9 * count)) ** 3)
     out = np.ones(len(f.gap.rows.channels))
     for c in np.unique(channel):
         mine = np.flatnonzero((channel == c) & (f.count >= 8))

@@ -266,6 +266,9 @@ QUANTISATION = HandEffect(
 # Samples taken at irregular times.
 
 JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
+# physics: residuals for each wrong time: it enters vx and vy, and each as the difference of two times, whose
+# square is correlated by a quarter with those of two others
+ALIKE = 3.0
 
 
 def _scatter_clock_jitter(given, residual: np.ndarray):
@@ -274,11 +277,11 @@ def _scatter_clock_jitter(given, residual: np.ndarray):
     rows, rate = rows_of(given), _clock_rates(given)[given.there]
     size = np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1)
     part = rows.trial * len(rows.parts) + rows.part
-    return on_grid("clock_jitter", residual**2, size[rows.cell], JITTERS, part)
+    return on_grid("clock_jitter", residual**2, size[rows.cell], JITTERS, part, alike=ALIKE)
 
 
 def _clock_rates(given) -> np.ndarray:
-    """Whitened change per second of clock error (T, N, C), from fast motion alone."""
+    """Whitened change per second of clock error (T, N, C), whose mean over grouped samples counts."""
     world = given.frame.world
     _, velocity = tips(world)
     step = np.median(np.diff(world.t, axis=1))
@@ -289,7 +292,7 @@ def _clock_rates(given) -> np.ndarray:
     rate = gradient(world.t, mean_v)
     for k, c in enumerate(("vx", "vy")):
         out[..., CHANNELS.index(c)] = np.hypot(mean_v[..., k] / step, rate[..., k]) / np.sqrt(2)
-    return out * given.weight
+    return out * given.weight / np.sqrt(np.array(given.frame.groups))[:, None, None]
 
 
 CLOCK_JITTER = HandEffect(

@@ -60,7 +60,7 @@ class Scatter:
 
 def on_grid(
     effect: str, square: np.ndarray, unit: np.ndarray, grid: np.ndarray, part: np.ndarray | None = None,
-    spread: float = 0.0,
+    spread: float = 0.0, alike: float = 1.0,
 ) -> Scatter:  # fmt: skip
     """The most likely size of a random effect whose variance is size^2 `unit`.
 
@@ -74,10 +74,11 @@ def on_grid(
         grid: Sizes.
         part: Part (n,) of each residual; a single cause has the same size in all parts.
         spread: Standard deviation of the log size between parts.
+        alike: Number of residuals for each independent disturbance.
     """
     mine = np.flatnonzero(unit > 0)
     variance = 1 + grid[:, None] ** 2 * unit[mine]
-    nats = 0.5 * (square[mine] * (1 - 1 / variance) - np.log(variance))
+    nats = 0.5 / alike * (square[mine] * (1 - 1 / variance) - np.log(variance))
     score = nats.sum(1)
     best, weight = int(score.argmax()), np.exp(score - score.max())
     centre = np.average(np.log(grid), weights=weight)

@@ -385,6 +385,18 @@ def test_the_level_of_the_noise_is_that_of_its_mean_square_in_small_groups_too()
     assert np.mean(found) == pytest.approx(1.0, abs=0.04)
 
 
+def test_what_a_random_effect_scatters_is_no_noise_besides():
+    found, nothing, rows = [], np.zeros(0), rows_of(trials=3, parts=12)
+    extra = np.where(rows.channel == 1, 8.0, 0.0)
+    for seed in range(10):
+        residual = np.random.default_rng(seed).standard_normal(extra.size) * np.sqrt(1 + extra)
+        noisy = Candidate("noisy", (), nothing, nothing, nothing, np.zeros(extra.size),
+                          np.zeros((extra.size, 0)), nothing, nothing, extra)  # fmt: skip
+        f = forms(Gap(rows, residual, np.zeros((extra.size, 0)), (noisy,)))
+        found.append(noise_of(f, fitted(f, (0,))) ** 2)
+    np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.1)
+
+
 @pytest.mark.parametrize("wander", [0.0, 0.3])
 def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
     rows = rows_of(samples=30)

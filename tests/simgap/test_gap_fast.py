@@ -20,10 +20,10 @@ BLOCKS = {"block1": Block(0.5, 0.018, 0.016), "block2": Block(0.6, 0.026, 0.016)
 TWICE = OperatorSettings(pace=(1.8, 2.0))
 
 
-def trials(effects, operator=None):
+def trials(effects, operator=None, rig=RIG):
     """Four trials of our own simulator."""
-    done = performed(TASK, RIG, [BLOCKS] * 4, [31, 32, 33, 34], effects, operator)
-    return [recorded(s, TASK, RIG, effects) for s in done]
+    done = performed(TASK, rig, [BLOCKS] * 4, [31, 32, 33, 34], effects, operator)
+    return [recorded(s, TASK, rig, effects) for s in done]
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +38,15 @@ def test_fast_work_shows_no_irregular_clock(fast):
     given, healthy = fast
     (clock,) = scatters(given, healthy.residual, ["clock_jitter"])
     assert clock.value < 1.5e-3 or not clock.same
+
+
+@double_precision
+def test_an_irregular_clock_has_its_own_size_though_samples_are_grouped():
+    rig = RIG.model_copy(update={"rate": 100.0})
+    given = problem(build(align(trials({"clock_jitter": {"sd": 4e-3}}, rig=rig), TASK, rig)))
+    assert given.frame.groups[0] > 2
+    (clock,) = scatters(given, fit(given, (), neutral(given)).residual, ["clock_jitter"])
+    assert clock.same and clock.value == pytest.approx(4e-3, rel=0.3)
 
 
 @pytest.mark.parametrize(
