@@ -25,7 +25,7 @@ from simgap.attribution.verdict import ACTED, RECORD
 
 RESULT = Path(__file__).parent / "results" / "gap_labs.json"
 SEEN = 0.01  # probability to act below which an effect is not listed
-WEAK = 0.3  # of the gap of held-out trials: causes that explain less are none
+WEAK = 0.3  # of the gap of held-out trials: causes that explain less are none, and more left is a remainder
 
 
 def outcome(label: dict[str, Any], found: dict[str, Any]) -> str:
@@ -130,6 +130,11 @@ def table(found: dict[str, Any]) -> str:
         named = [r for r in rows if r["verdict"] in ("named", "set")]
         return f"{sum(r['held_out'] is not None and r['held_out'] < WEAK for r in named)} of {len(named)}"
 
+    def open_left(rows: Sequence[dict[str, Any]]) -> str:
+        of = [r for r in rows if r["tier"] == "outside"]
+        right = (r["outcome"] == "unknown" or (r["causes"] and (r["held_out"] or 0.0) < 1 - WEAK) for r in of)
+        return f"{sum(map(bool, right))} of {len(of)}" if of else ""
+
     def held(rows: Sequence[dict[str, Any]]) -> str:
         each = [one for r in rows for one in r.get("covered", [])]
         return f"{sum(each)} of {len(each)}" if each else ""
@@ -145,6 +150,7 @@ def table(found: dict[str, Any]) -> str:
         line("pairs: whole", ["pair"], "named"),
         line("pairs: one of both", ["pair"], "half"),
         line("outside: unknown", ["outside"], "unknown"),
+        ["outside: unknown, or over 30 % left", *(open_left(rows) for rows in runs.values())],
         ["named with a held-out share below 0.3", *(weak(rows) for rows in runs.values())],
         ["what is named: mean probability; right", *(reliability(r, "named", "set") for r in runs.values())],
         ["none: mean probability; right", *(reliability(r, "none") for r in runs.values())],
