@@ -225,8 +225,8 @@ class Heldout:
         """
         model, taken = fitted(train, effects), quadratic_forms(test, effects)
         weight = np.exp(-taken.shift) / (self.noise[channel_of(test)] + form_error(test, fitted(train, off)))
-        loose = ~model.at_bound  # parameters at a bound stay there
-        precision = np.zeros_like(model.covariance)
+        loose = ~model.at_bound  # parameters at a bound stay there, even if this trial does not show them
+        precision = np.diag(np.where(loose, 0.0, 1.0))
         precision[np.ix_(loose, loose)] = np.linalg.inv(model.covariance[np.ix_(loose, loose)])
         low, high = (np.where(loose, edge, model.x) for edge in (taken.low, taken.high))
         matrix, pull = taken.weighed(weight)
