@@ -352,7 +352,7 @@ def test_an_opening_is_read_as_it_comes():
     assert grip.grip.width == pytest.approx(0.03, abs=3 * grip.grip.width_sd)
     assert grip.start == pytest.approx(0.7, abs=0.03) and grip.stop == pytest.approx(2.0, abs=0.03)
     assert (np.diff(known) >= 0).all() and (t - known).max() < 0.3
-    assert closings.free(0.3, 0.05) and not closings.free(1.0, 0.029)
+    assert closings.free(np.array([0.3, 1.0]), np.array([0.05, 0.029])).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("give", [1e-3, 3e-3])
