@@ -10,11 +10,10 @@ import _thread
 import contextlib
 import gc
 import os
-import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
@@ -31,6 +30,7 @@ from hmmseg_cli import (
     inspect,
     play,
     robot,
+    run,
     segment,
     simulate,
     watch,
@@ -171,13 +171,6 @@ def _open_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
     if sys.stdin is None:
         sys.stdin = open(os.devnull, encoding="utf-8")  # noqa: SIM115
-
-
-def run() -> NoReturn:
-    """Run the command line as a process, whose exit code no interrupt changes once all is written."""
-    code = main()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    sys.exit(code)
 
 
 if __name__ == "__main__":

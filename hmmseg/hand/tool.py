@@ -6,11 +6,12 @@ velocity of the tool, g gravity and f the force of the tool on its environment i
     F = b + Q (m_a R^T (a + tau da/dt) - m R^T g + d R^T v + f),
 
 where b is the sensor's offset, m the tool's mass, d the drag of cables and hoses, Q the axes of the sensor,
-with det Q = -1 if it reads the reaction, and tau the delay of the pose behind the wrench. m_a is m for a
-rigid tool; gears that spin with the arm make it appear larger, so it is fitted separately. In free motion f
-= 0, and the regression of F on the motion gives all of them (robust least squares; Q by Kabsch's 1976
-solution of the orthogonal Procrustes problem). An arm that never turns its hand shows only the sum of b and
-the tool's weight, which suffices, as the weight is then constant.
+with det Q = -1 if it reads the reaction. m_a is m for a rigid tool; gears that spin with the arm make it
+appear larger, so it is fitted separately. In free motion f = 0, and the regression of F on the motion gives
+all of them (robust least squares; Q by Kabsch's 1976 solution of the orthogonal Procrustes problem). Where
+the pose lags behind the wrench, or leads, F is compared with the motion whole samples later, or earlier, and
+tau is what is left of this delay. An arm that never turns its hand shows only the sum of b and the tool's
+weight, which suffices, as the weight is then constant.
 """
 
 from __future__ import annotations
@@ -143,6 +144,8 @@ def smooth(t: np.ndarray, values: np.ndarray, deriv: int = 0, window: float = WI
 ROUNDS = 20  # numerics: iterations of the robust fit, which converges sooner
 TURNED = 0.02  # chosen: rad, root mean square: a hand that turns less does not show its weight
 SAMPLES = 20  # numerics: least samples of free motion
+STARTS = 4  # numerics: delays that the fit may start from, half a window apart, to either side of none
+DELAY = 0.05  # prior: s; sd of the delay between pose and wrench, two streams of one controller
 
 
 @dataclass(frozen=True)
@@ -152,8 +155,9 @@ class Tool:
     Attributes:
         axes: Q (3, 3).
         shares: (4,) coefficients of the acceleration (inertia) [kg], of the weight [kg] (0 unless
-            `weighed`), of the velocity (drag) [N s/m] and of the jerk [kg s] (inertia times the delay of the
-            pose).
+            `weighed`), of the velocity (drag) [N s/m] and of the jerk [kg s] (inertia times what is left of
+            the delay).
+        delay: of the pose behind the wrench [s], in whole samples.
         weighed: whether the weight was separated from the offset.
         offset, drift: (3,) of the sensor [N, N/s].
         noise: scale of one component of F in free motion about the model [N].
@@ -164,6 +168,7 @@ class Tool:
 
     axes: np.ndarray
     shares: np.ndarray
+    delay: float
     weighed: bool
     offset: np.ndarray
     drift: np.ndarray
@@ -185,16 +190,22 @@ class Tool:
 
 @dataclass(frozen=True)
 class FreeMotion:
-    """Samples of free motion at `t` (n,) [s]: smoothed readings and their regressors.
+    """Samples of free motion at `t` (n,) [s] with smoothed readings, and all regressors.
 
-    `force` (n, 3) [N]; `terms` (4, n, 3): acceleration, minus gravity, velocity and jerk, in the axes of the
-    wrench up to a constant rotation; `window` [s]: samples nearer to each other are not independent.
+    `force` (n, 3) [N]; `regressors` (4, num_timesteps, 3) at `every` (num_timesteps,) [s]: acceleration,
+    minus gravity, velocity and jerk, in the axes of the wrench up to a constant rotation; `window` [s]:
+    samples nearer to each other are not independent.
     """
 
     t: np.ndarray
     force: np.ndarray
-    terms: np.ndarray
+    every: np.ndarray
+    regressors: np.ndarray
     window: float
+
+    def terms(self, delay: float) -> np.ndarray:
+        """The regressors (4, n, 3) a `delay` [s] later, to the nearest sample."""
+        return self.regressors[:, _nearest(self.every, self.t + delay)]
 
 
 def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
@@ -202,8 +213,13 @@ def wrench_of(trial: Trial, gripper: Gripper) -> np.ndarray:
     return np.stack([trial.channels[name] for name in gripper.wrench[:3]], axis=1)
 
 
-def _terms(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
-    """Acceleration, minus gravity, velocity and jerk (4, num_timesteps, 3), as in `FreeMotion.terms`."""
+def _nearest(every: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Index (n,) of the one of `every` time (num_timesteps,) that is nearest to each of t (n,)."""
+    return np.searchsorted((every[1:] + every[:-1]) / 2, t)
+
+
+def _regressors(pose: Pose, gripper: Gripper, gravity: float) -> np.ndarray:
+    """Acceleration, minus gravity, velocity and jerk (4, num_timesteps, 3), as in `FreeMotion`."""
     weight = np.broadcast_to(gravity * pose.up, pose.acceleration.shape)
     jerk = np.gradient(pose.acceleration, pose.t, axis=0)
     every = (pose.acceleration, weight, pose.velocity, jerk)
@@ -217,7 +233,8 @@ def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMot
     gripper = rig.wrist
     force = np.stack([bridged(c, trial.t) for c in wrench_of(trial, gripper).T], axis=1)
     force = smooth(trial.t, force, window=pose.window)[free]
-    return FreeMotion(trial.t[free], force, _terms(pose, gripper, rig.gravity)[:, free], pose.window)
+    every = _regressors(pose, gripper, rig.gravity)
+    return FreeMotion(trial.t[free], force, trial.t, every, pose.window)
 
 
 def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
@@ -237,50 +254,68 @@ def tool_of(file: str, rig: Rig, motion: FreeMotion, since: float, between: bool
     if motion.t.size < SAMPLES:
         raise InputError(where, "show no free motion to find the tool's own share from",
                          "samples before the first grip and after the last")  # fmt: skip
-    # Smoothed samples within one window are not independent.
-    together = max(1.0, motion.window / float(np.median(np.diff(motion.t))))
     time = motion.t - since
-    axes, found, unit, noise = _fit(rig, motion, time)
-    error = noise * np.sqrt(together) * unit
+    axes, found, error, noise, delay = _fit(rig, motion, time)
     if not between and np.all(np.abs(found[7:]) < SURE * error[7:]):
-        axes, found, _, noise = _fit(rig, motion, 0 * time)
+        axes, found, _, noise, delay = _fit(rig, motion, 0 * time)
     left_open = gripper.frame == "sensor" and gripper.sensor_axes is None
     if (left_open or gripper.reaction is None) and abs(found[0]) < SURE * error[0]:
         problem = "do not show the hand's own mass in free motion, so the sensor's axes are undetermined"
         raise InputError(where, problem, 'sensor_axes = ["x", "y", "z"] and reaction = true or false '
                          "under [gripper], as they are mounted")  # fmt: skip
     return Tool(
-        axes, found[:4], bool(found[1] != 0.0), axes @ found[4:7], axes @ found[7:], noise, since,
+        axes, found[:4], delay, bool(found[1] != 0.0), axes @ found[4:7], axes @ found[7:], noise, since,
         float(error[7:].max()), bool(gripper.reaction is not None and found[0] < -SURE * error[0]),
     )  # fmt: skip
 
 
 def _fit(rig: Rig, motion: FreeMotion, time: np.ndarray
-         ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:  # fmt: skip
-    """Axes, coefficients along them, their standard errors for unit noise, and the noise.
+         ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, float]:  # fmt: skip
+    """Axes, coefficients along them, their standard errors, the noise, and the delay of the pose.
 
-    Robust least squares, in turns with the axes, of F in the tool's axes on the four terms (without the
-    weight if the hand does not turn), the offset (3) and the drift (3).
+    Robust least squares, in turns with the axes and the delay (Gauss-Newton), of F in the tool's axes on the
+    four terms (without the weight if the hand does not turn), the offset (3) and the drift (3).
     """
-    gripper, terms, n = rig.wrist, motion.terms, motion.t.size
-    turns = gripper.turns and gripper.frame != "world" and _spread(terms[1]) > TURNED * rig.gravity
+    gripper, n = rig.wrist, motion.t.size
+    weight = motion.terms(0.0)[1]
+    turns = gripper.turns and gripper.frame != "world" and _spread(weight) > TURNED * rig.gravity
     given = gripper.tool_mass
-    known = 0.0 if given is None else given * terms[1]
-    hung = terms[1] * (turns and given is None)
     constant = np.broadcast_to(np.eye(3), (n, 3, 3))  # row, axis, parameter
-    moving = np.stack([terms[0], hung, terms[2], terms[3]], axis=2)
-    rows = np.concatenate([moving, constant, constant * time[:, None, None]], axis=2)
-    weights = np.ones(n)
-    for _ in range(ROUNDS):
+    # Smoothed samples within one window are not independent.
+    together = max(1.0, motion.window / float(np.median(np.diff(motion.t))))
+    farthest = motion.window / 2  # beyond which the jerk does not continue a smoothed acceleration
+    period = float(np.median(np.diff(motion.every)))
+
+    def regressed(delay: float, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Axes, coefficients, their standard errors for unit noise, and the residual (n, 3)."""
+        terms = motion.terms(delay)
+        moving = np.stack([terms[0], terms[1] * (turns and given is None), terms[2], terms[3]], axis=2)
+        rows = np.concatenate([moving, constant, constant * time[:, None, None]], axis=2)
         axes = _axes(gripper, weights, motion.force, terms[0] + terms[1])
-        left, root = motion.force @ axes - known, np.sqrt(weights)[:, None]
-        flat = (rows * root[:, :, None]).reshape(3 * n, -1)
-        found, *_ = np.linalg.lstsq(flat, (left * root).ravel(), rcond=1e-9)
-        residual = left - rows @ found
+        left = motion.force @ axes - (0.0 if given is None else given * terms[1])
+        weighed = (rows * weights[:, None, None]).reshape(3 * n, -1).T
+        covariance = np.linalg.pinv(weighed @ rows.reshape(3 * n, -1), rcond=1e-14, hermitian=True)
+        found = covariance @ (weighed @ left.ravel())
+        return axes, found, np.sqrt(np.diag(covariance)), left - rows @ found
+
+    def unlikely(delay: float) -> float:
+        """Minus its log density with normal noise."""
+        square = float(np.square(regressed(delay, np.ones(n))[3]).mean()) + 1e-12
+        return 3 * n / together * np.log(square) + (delay / DELAY) ** 2
+
+    starts = [round(k * farthest / period) * period for k in range(-STARTS, STARTS + 1)]
+    following, weights = min(starts, key=unlikely), np.ones(n)
+    for _ in range(ROUNDS):
+        delay = following
+        axes, found, unit, residual = regressed(delay, weights)
         noise = max(robust_sd(residual), 1e-6)
+        error = noise * np.sqrt(together) * unit
         weights = (TAIL + 3) / (TAIL + ((residual / noise) ** 2).sum(axis=1))
+        doubt = (error[3] / DELAY) ** 2
+        step = (found[0] * found[3] - doubt * delay) / (found[0] ** 2 + doubt + 1e-12)
+        following = delay + float(np.fix(np.clip(step, -farthest, farthest) / period)) * period
     found[1] = given or found[1] * turns
-    return axes, found, np.linalg.norm(np.linalg.pinv(flat, rcond=1e-9), axis=1), noise
+    return axes, found, error, noise, delay
 
 
 def _spread(vectors: np.ndarray) -> float:
@@ -313,7 +348,8 @@ def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
     """Force of the tool on its environment (num_timesteps, 3), in the world's axes [N]."""
     gripper = rig.wrist
     reading = wrench_of(trial, gripper) - tool.offset - tool.drift * (trial.t - tool.since)[:, None]
-    own = np.tensordot(tool.shares, _terms(pose, gripper, rig.gravity), 1)
+    later = _nearest(trial.t, trial.t + tool.delay)
+    own = np.tensordot(tool.shares, _regressors(pose, gripper, rig.gravity), 1)[later]
     force = reading @ tool.axes - own
     return force if gripper.frame == "world" else np.einsum("tij,tj->ti", pose.turned, force)
 

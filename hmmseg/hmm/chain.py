@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax
 import numpy as np
@@ -38,7 +38,7 @@ class Leaves:
         return tuple(getattr(self, name) for name in self.leaves), None
 
     @classmethod
-    def tree_unflatten(cls, _: None, leaves: tuple) -> Self:
+    def tree_unflatten(cls, _: None, leaves: tuple) -> Any:
         """An instance with these leaves, which may be any JAX values."""
         tree = object.__new__(cls)
         vars(tree).update(zip(cls.leaves, leaves, strict=True))

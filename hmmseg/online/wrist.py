@@ -307,7 +307,7 @@ class Opening(Closings):
         """While held, samples wait if it may be letting go."""
         if opening < held.grip.held - self.swing:  # the closing had only paused
             self.refused, self.known = self.grips.pop(), held.start
-        elif self.closing and opening <= held.grip.width:
+        elif opening <= held.grip.width:  # on its way or not: the pads touch
             self._wide, self.known = math.nan, t
         else:
             self._wide = t if math.isnan(self._wide) else self._wide

@@ -5,6 +5,9 @@ import pytest
 
 from experiments.real import hiro_snap
 from hmmseg.errors import InputError
+from hmmseg.io.task import SequenceTask
+from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.segment import segment_sequence
 
 
 def test_snap_trials_are_read_and_cropped(shared):
@@ -26,13 +29,37 @@ def test_malformed_snap_trials_are_refused(tmp_path):
         hiro_snap.read_trial(tmp_path)
 
 
+# Recordings do not tell which of their changes the task names. Where their number leaves that open, as on
+# guarded trials for the mating, the reported time is one of several listed places, and one labelled trial
+# decides.
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["real_guarded", "real_pivot"])
-def test_snap_boundaries(shared, kind):
+@pytest.mark.parametrize(("kind", "decided"), [("real_guarded", [0]), ("real_pivot", [0, 1])])
+def test_snap_boundaries(shared, kind, decided):
     trials = hiro_snap.read_kind(shared / "real/hiro_snap", kind)
     description = hiro_snap.KINDS[kind]
     taught, clock = hiro_snap.with_labels(trials, description, hiro_snap.WRENCH_AND_POSE, seed=11)
     assert max(hiro_snap.summary(taught)["median_abs"]) <= 0.06
     assert np.median(np.abs(clock)) > 0.2  # the crop leaves the clock nothing
-    alone = hiro_snap.without_labels(trials, description, hiro_snap.WRENCH_AND_POSE, seed=11)
-    assert min(hiro_snap.summary(alone)["within_0.3"]) == 1.0
+    alone = hiro_snap.summary(
+        hiro_snap.without_labels(trials, description, hiro_snap.WRENCH_AND_POSE, seed=11)
+    )
+    assert min(np.array(alone["within_0.3"])[decided]) == 1.0
+    assert min(alone["coverage_90"]) == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["real_guarded", "real_pivot"])
+def test_snap_boundaries_are_listed_and_one_labelled_trial_decides(shared, kind):
+    description, rng = hiro_snap.KINDS[kind], np.random.default_rng(11)
+    task = SequenceTask(description.sequence, hiro_snap.WRENCH_AND_POSE)
+    trials, labels = zip(*hiro_snap.read_kind(shared / "real/hiro_snap", kind), strict=True)
+    trials = [hiro_snap.cropped(trial, rng.uniform(0, hiro_snap.MAX_CROP)) for trial in trials]
+    model = fit_sequence(trials, task, {trials[0].file: labels[0]})
+    alone, decided = segment_sequence(trials, task), segment_sequence(trials[1:], task, model)
+    for b in description.scored:
+        for found, label in zip(alone, labels, strict=True):
+            span = found.spans[1:][b]
+            places = [place.time for place in span.alternatives] or [span.start]
+            assert min(abs(time - label[b]) for time in places) < 0.3
+        for found, label in zip(decided, labels[1:], strict=True):
+            assert abs(found.spans[1:][b].start - label[b]) < 0.3

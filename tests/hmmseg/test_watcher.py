@@ -352,7 +352,21 @@ def test_an_opening_is_read_as_it_comes():
     assert grip.grip.width == pytest.approx(0.03, abs=3 * grip.grip.width_sd)
     assert grip.start == pytest.approx(0.7, abs=0.03) and grip.stop == pytest.approx(2.0, abs=0.03)
     assert (np.diff(known) >= 0).all() and (t - known).max() < 0.3
-    assert closings.free(0.3, 0.05) and not closings.free(1.0, 0.029)
+    assert closings.free(np.array([0.3, 1.0]), np.array([0.05, 0.029])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("give", [1e-3, 3e-3])
+def test_a_grip_lasts_until_its_pads_let_go(give):
+    """However far they have yielded: a gripper has turned long before."""
+    t = np.arange(0, 3, 0.01)
+    way = np.maximum(0.036 - 0.1 * np.clip(t - 0.5, 0, None), 0.03 - give)
+    opening = way + 0.1 * np.clip(t - 2, 0, None)
+    closings = Opening(3000.0)
+    for at, value in zip(t, opening, strict=True):
+        closings.follow(float(at), float(value))
+    (grip,) = closings.grips
+    before, after = opening[np.searchsorted(t, grip.stop) - np.array([1, 0])]
+    assert before <= grip.grip.width < after
 
 
 def test_a_load_that_vanishes_is_told_within_half_a_second(shared):

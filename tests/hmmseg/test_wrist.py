@@ -104,6 +104,23 @@ def test_the_tool_is_found_from_free_motion(performed):
     assert np.abs(force.mean(axis=0)).max() < 0.01
 
 
+@pytest.mark.parametrize("late", [-0.04, 0.02, 0.06, 0.14])
+def test_the_tool_is_found_where_forces_come_late(performed, late):
+    """Late by more than an acceleration lasts, where its tangent says nothing of it."""
+    columns = wrist_recording(performed[0], PLAIN)
+    t, rig = columns["t"], wrist_rig(PLAIN)
+    delayed = {f"F{axis}": np.interp(t - late, t, columns[f"F{axis}"]) for axis in "xyz"}
+
+    def found(columns):
+        trial = trial_of(frame_table(columns, None), rig, None)
+        return free_tool(trial, rig, pose_of(trial, rig.gripper), (t > 0.2) & (t < 1.5))
+
+    tool, usual = found(columns | delayed), found(columns)
+    assert tool.delay == pytest.approx(-late, abs=1e-3)
+    assert tool.inertia == pytest.approx(usual.inertia, rel=0.05)
+    assert tool.noise < 1.2 * usual.noise
+
+
 def test_an_open_hand_at_rest_holds_nothing():
     """It stands as wide open as the other block is for its first second, and forces tell little at 20 Hz."""
     setup = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))

@@ -10,6 +10,7 @@ import io
 import json
 import os
 import pty
+import shlex
 import shutil
 import signal
 import subprocess
@@ -175,12 +176,12 @@ def test_a_rename_that_is_refused_leaves_results_of_before(lab, monkeypatch, cap
     assert "cannot be written (No space left on device)" in capsys.readouterr().err
 
 
-PROCESS = [sys.executable, "-m", "hmmseg_cli.main"]
+PROCESS = [sys.executable, "-c", "from hmmseg_cli import run; run()"]  # as the installed command has it
 
 
 @pytest.mark.parametrize("stdout", ["closed", "full", "gone"])
 def test_without_a_reader_the_work_is_kept_and_said(stdout, lab):
-    command = " ".join([*PROCESS, *COMMANDS["decompose"]])
+    command = shlex.join([*PROCESS, *COMMANDS["decompose"]])
     end = {"closed": ">&-", "full": "> /dev/full", "gone": "| true"}[stdout]
     run = subprocess.run(
         ["bash", "-c", f"set -o pipefail; {{ sleep 0; {command}; }} {end}"], capture_output=True, text=True
@@ -231,7 +232,7 @@ def test_nothing_is_written_into_the_package_and_no_home_is_needed(lab, monkeypa
 
 def test_a_page_watched_in_the_terminal_leaves_standard_output_alone(lab):
     rows = Path("trial.csv").read_bytes().splitlines(keepends=True)[:40]
-    script = f"exec {' '.join(PROCESS)} watch --plot {' '.join(HAND)} > answers.jsonl"
+    script = f"exec {shlex.join(PROCESS)} watch --plot {' '.join(HAND)} > answers.jsonl"
     main_end, terminal = pty.openpty()  # standard error is a terminal, as a user has it
     run = subprocess.Popen(["bash", "-c", script], stdin=subprocess.PIPE, stderr=terminal)
     os.close(terminal)
@@ -342,11 +343,26 @@ def test_ctrl_c_in_a_callback_is_heard(capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_ctrl_c_while_the_command_is_imported(lab):
+    """As on a machine so busy that imports take seconds."""
+    stop = """
+import sys
+class Interrupted:
+    def find_spec(name, *_):
+        if name == "typer":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupted)
+"""
+    command = [sys.executable, "-c", stop + PROCESS[-1], "decompose", "task.toml"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
 def sent(command, moment, stdin=None):
     """Standard output and error of a process that gets Ctrl-C after so many seconds, and its exit code."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "hmmseg_cli.main", *command], stdin=stdin or subprocess.DEVNULL,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+        [*PROCESS, *command], stdin=stdin or subprocess.DEVNULL, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, start_new_session=True,
     )  # fmt: skip
     try:
         process.wait(moment)
