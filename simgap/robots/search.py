@@ -18,6 +18,8 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student
 
+from simgap.attribution.verdict import RULED_OUT
+from simgap.latest import latest
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration
@@ -51,6 +53,7 @@ JOINED = " against "
 NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
+SETTLED = 0.3  # numerics: nats to which the best set is fitted in the end, as three rule others out
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
 BY_CHANCE = 0.05  # chosen: of sets that predict held-out folds no better, the share that may be said to
@@ -119,7 +122,8 @@ class Search:
     columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
-    _starts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    _starts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)  # of the empty set: steers fits
+    _proposed: dict = field(default_factory=dict, repr=False)
     _densities: dict[tuple[FittedSet, Whitener], np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -137,14 +141,22 @@ class Search:
         """The best set, searched forwards from nothing and, where that leaves a gap, backwards from the
         calibration."""
         best = self._from(self.nothing(), tell)
-        if best.squares[best.fine].mean() < LEAVES * best.noise:
-            return best
-        tell("from the calibration")
-        self.columns.clear()
-        other = self._from_calibration()
-        if other is not None and other.squares.sum() < best.squares.sum():
-            other = self._from(other, tell)
-            best = other if self._is_better(other, best) else best
+        if best.squares[best.fine].mean() > LEAVES * best.noise:
+            tell("from the calibration")
+            self.columns.clear()
+            other = self._from_calibration()
+            if other is not None and self._is_better(other, best):
+                best = self._from(other, tell)
+        return self._settled(best)
+
+    def _settled(self, best: FittedSet) -> FittedSet:
+        """The best set, it and all that it may or may not rule out fitted to the end."""
+        if best.promise > best.score + SETTLED:
+            best = self.fit(best.names, best.point, [best.whiten])
+        ruled_out = best.score - np.log(RULED_OUT)
+        for one in [*self.fitted.values()]:
+            if one.score < ruled_out < one.promise:
+                self.fit(one.names, one.point, [one.whiten])
         return best
 
     def forced(self, names: Names) -> FittedSet:
@@ -259,8 +271,12 @@ class Search:
         return fit_effects(composed, linear, whiten, begin)
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
-        """A set at its fitted point, with its discrepancy and its log evidence (Laplace's)."""
-        linear = linearise(composed, point, [*self.along, *names], self._starts)
+        """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).
+
+        Friction damps the errors of starts, so that their sensitivities are a set's own: with another's,
+        something always seems to be left.
+        """
+        linear = linearise(composed, point, [*self.along, *names])
         cov = covariances(composed, linear)
         left = np.nan_to_num(linear.residual)
         discrepancy = cov.estimate(left)
@@ -302,7 +318,7 @@ class Search:
         small change. They stay as they were where the search began; the leading ones are rolled out anew.
         """
         composed, point, held = at.composed, at.point, at.names
-        linear = linearise(composed, point, [*self.along, *held], self._starts)
+        linear = linearise(composed, point, [*self.along, *held], at.linear.starts)
         base, more = base_at(composed, point), {}
         for name in names:
             if name not in held:
@@ -400,7 +416,7 @@ class Search:
 
         `at` is the best itself, or the best less one cause, whose replacements are then sought.
         """
-        sets, levels = self.propose(at, self.wanted)
+        sets, levels = latest(self._proposed, at, lambda: self.propose(at, self.wanted))
         names = [n for n in sets.names if n not in self.against]
         near = neighbours(at.names, sets.names)
         if at is best and len(names) <= MANY:  # a replacement is a single effect

@@ -102,6 +102,9 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
     held = Held(np.array([0.0, 0.01, 0.02]), np.arange(0, 0.02, 0.005))  # a line is half a sample sooner
     np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 1.0), [0.5, 1.5, 1.75, 1.25])
     np.testing.assert_allclose(held(np.array([0.0, 2.0, 1.0]), 0.5), [0.25, 0.75, 1.875, 1.625])
+    held = Held(np.array([0.0, 0.01]), np.arange(0, 0.02, 0.005))  # and goes on where samples end
+    np.testing.assert_allclose(held(np.array([0.0, 2.0]), 1.0), [0.5, 1.5, 2.5, 3.5])
+    np.testing.assert_allclose(Held(np.zeros(1), np.arange(0, 0.02, 0.005))(np.ones(1), 1.0), np.ones(4))
 
 
 @pytest.mark.parametrize(
@@ -252,6 +255,22 @@ def turning(files, described: str = TURN, more: str = ""):
         return found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 1.8})["q"]
 
     return found, run
+
+
+def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
+    found, run = turning(files)
+    model = found.simulator.model
+    data, h = mujoco.MjData(model), float(model.opt.timestep)
+    data.qpos[:], data.qvel[:] = 0.0, 1.8
+    t, asked = np.arange(0, 2, 0.01), []
+    for k in range(round(1.99 / h) + 1):
+        asked.append(float(data.qpos[0]))
+        data.ctrl[:] = np.interp(k * h, t, 0.3 * np.sin(6 * t))
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(
+        run(option__hold=1.0), np.interp(t, h * np.arange(len(asked)), asked), atol=1e-5
+    )
+    assert np.abs(run(option__hold=1.0, option__late=0.5) - run(option__hold=1.0)).max() > 1e-4
 
 
 @pytest.mark.parametrize(("place", "at"), [("", 0.2), ('payload_at = {arm = "tool"}\n', 0.2),

@@ -47,7 +47,9 @@ class Held:
         done = np.cumsum((u[..., :-1] + 0.5 * line * rise) * wide, -1)
         area = np.concatenate([np.zeros((*done.shape[:-1], 1)), done], -1)
         steep = line * rise / np.where(wide > 0, wide, np.inf)
-        slope = np.concatenate([steep, np.zeros((*done.shape[:-1], 1))], -1)
+        slope = np.zeros(u.shape)
+        slope[..., :-1] = steep
+        slope[..., -1] = slope[..., -min(2, u.shape[-1])]  # the step in which the samples end
         here, held, begun, steep = (np.take_along_axis(v, k, -1) for v in (area, u, t, slope))
         late = self.edges - begun
         return np.diff(here + (held + 0.5 * steep * late) * late) / self.width
@@ -161,7 +163,8 @@ class Runs:
         control = np.zeros((len(logs), times.size, self.model.nu))
         line, late = (dict(changed).get(name, 0.0) for name in (HOLD, LATE))
         for (mine, own), (plain, _) in zip(parts, sides, strict=True):
-            held = _carried_out(own, plain, late * h)
+            # A loop that sets a command and makes a step has the line where the step begins, not its mean.
+            held = _carried_out(own, plain, (late + 0.5 * line) * h)
             for column, place in self.driven.items():
                 control[mine, :, place] = held(np.array([_commanded(log, column) for log in own]), line)
         sensed = self._sensed(first, control, changed)

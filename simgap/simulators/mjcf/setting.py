@@ -19,7 +19,8 @@ from simgap.simulators.mjcf.engine import FREE, HINGE, mujoco
 Put = Callable[[Any, float], None]
 OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
 FADE = "fade"  # a law of actuators
-HOLD = "option.hold"  # how commands are held between samples: 0 in steps, 1 in lines to the next
+# How commands are held between samples: 0 in steps; 1 in lines to the next, as they are where a step begins.
+HOLD = "option.hold"
 LATE = "option.late"  # share of a step by which commands come later
 
 
