@@ -400,7 +400,8 @@ def plan(c: Conformity, steps: tuple[Subtask, ...]) -> Plan:
     failing = c.failing
     if failing is None:
         raise ValueError("the trial fits its task")
-    runs = list(c.runs)
+    unseen = next((i for i, r in enumerate(c.runs) if r.state != FREE and r.block is None), len(c.runs))
+    runs = list(c.runs[: max(unseen, 1)])  # of a block that no grip shows nothing is known
     if c.wrong_rise is not None:  # wrong block or place: nothing from there on belongs to the task
         runs = [replace(r, subtask=None) if r.subtask is None or r.subtask >= failing else r for r in runs]
     before = sum(r.subtask is not None for r in runs)

@@ -318,15 +318,21 @@ def _recovered(
     every: AlignedTrials, aligned: AlignedTrials, given: Problem, best: Fitted
 ) -> AlignedTrials | None:
     """The trials that fit their task once corrected for the best explanation; None unless these are more."""
-    if len(aligned.trials) == len(every.trials):
+    shown = _shown(every)
+    if len(aligned.trials) >= len(shown):
         return None
-    forced = align([one.trial for one in every.trials], every.task, every.rig, all_fit=True)
+    forced = align(shown, every.task, every.rig, all_fit=True)
     frame = build(forced)
     if not np.isfinite(frame.world.events).all():  # no block is held anywhere
         return None
     again = realigned(forced, rebased(frame, given), best)
     fit_now = tuple(one for one in again.trials if one.segmentation.failed is None)
     return replace(again, trials=fit_now) if len(fit_now) > len(aligned.trials) else None
+
+
+def _shown(aligned: AlignedTrials) -> list[Trial]:
+    """The trials of which no channel is missing throughout."""
+    return [t.trial for t in aligned.trials if all(np.isfinite(v).any() for v in t.trial.channels.values())]
 
 
 def _aligned_all(
@@ -339,8 +345,9 @@ def _aligned_all(
     Returns:
         The trials, as they were if no candidate helps, and a warning that names the one that does.
     """
-    aligned = align([one.trial for one in failed.trials], failed.task, failed.rig, all_fit=True)
-    for _ in range(ROUNDS):
+    shown = _shown(failed)
+    aligned = align(shown, failed.task, failed.rig, all_fit=True) if shown else failed
+    for _ in range(ROUNDS if shown else 0):
         given = problem(build(aligned), actual)
         healthy = fit(given, (), neutral(given))
         if healthy.cost > HOPELESS * given.size:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from demo_recordings import RECORDINGS, recorded
 
+from hmmseg.errors import InputError
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import cosines
@@ -15,6 +16,7 @@ from simgap.gap.assemble import after, gap_of, rows_of, scatters, together
 from simgap.gap.frame import CHANNELS, build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import derivatives, fit, neutral, problem, slots
+from simgap.gap.search import search
 
 
 def read(name):
@@ -139,3 +141,20 @@ def test_quantisation_is_seen_and_not_imagined(healthy):
     coarse = replace(given, frame=replace(given.frame, forces=rounded))
     (seen,) = scatters(coarse, found.residual, ["quantisation"])
     assert seen.value == pytest.approx(0.04, rel=1e-3) and seen.known > 100
+
+
+@double_precision
+@pytest.mark.parametrize("broken", [1, 2])
+def test_a_trial_without_one_of_its_channels_is_left_out(broken):
+    trials, task, rig = recorded("none_1", 2)
+    mute = [
+        replace(t, channels=t.channels | {"q12": np.full(t.t.size, np.nan)}) if k < broken else t
+        for k, t in enumerate(trials)
+    ]
+    aligned = align(mute, task, rig)
+    assert [t.segmentation.complete for t in aligned.trials] == [False] * broken + [True] * (2 - broken)
+    if broken == 2:
+        with pytest.raises(InputError, match="trial_01"):
+            search(aligned, noisy=False)
+    else:
+        assert [t.name for t in search(aligned, noisy=False).trials] == ["trial_02.csv"]
