@@ -161,8 +161,8 @@ def table(found: dict[str, Any]) -> str:
          *(str(round(sorted(r["seconds"] for r in rows)[len(rows) // 2]) or "") for rows in runs.values())],
     ]  # fmt: skip
     wrong = [
-        f"{r['case']} {' + '.join(r['effects'])} ({r['outcome']}{': ' if r['causes'] else ''}"
-        f"{' + '.join(r['causes'])})"
+        f"{r['case']} {'+'.join(r['effects'])} ({r['outcome']}{': ' if r['causes'] else ''}"
+        f"{'+'.join(r['causes'])})"
         for r in list(runs.values())[-1]
         if not is_right(r)
     ]

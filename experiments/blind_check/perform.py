@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-import simgap.simulators.mjcf.engine  # noqa: F401 - counts warnings of failed line searches, prints none
 from experiments.blind_check.operator import Plan
 from experiments.blind_check.scene import DAMPING, STEP, TIP_MASS, Block, World, mjcf
 
 EVERY = round(0.001 / STEP)  # steps a millisecond
 SETTLE = 0.15  # s that the servos stand still before the trial
 FELT = 2e-3  # N, contact
+if mujoco.get_mju_user_warning() is None:  # it reports failed line searches on standard output
+    mujoco.set_mju_user_warning(lambda text: None)
 GAP = 30  # ms: a shock may lift a pad for less
 LIFT = 0.003  # m
 BOUNCE = 300  # ms after a release in which a finger may bounce
