@@ -18,7 +18,6 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student
 
-from simgap.attribution.verdict import RULED_OUT
 from simgap.latest import latest
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
@@ -54,6 +53,8 @@ NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
 SETTLED = 0.3  # numerics: nats to which the best set is fitted in the end, as three rule others out
+ASTRAY = 0.1  # numerics: difference of the numerics' parameters, of order one, that may be another optimum
+NEAR_BY = 20.0  # numerics: nats of the best set within which others are fitted to the end
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
 BY_CHANCE = 0.05  # chosen: of sets that predict held-out folds no better, the share that may be said to
@@ -150,23 +151,37 @@ class Search:
         return self._settled(best)
 
     def _settled(self, best: FittedSet) -> FittedSet:
-        """The best set, it and all that it may or may not rule out fitted to the end."""
+        """The best set, it and all that come near fitted to the end from the same numerics.
+
+        Of shares of a step by which commands may be late there are several local optima, and sets that differ
+        in them cannot be compared.
+        """
         if best.promise > best.score + SETTLED:
             best = self.fit(best.names, best.point, [best.whiten])
-        ruled_out = best.score - np.log(RULED_OUT)
+        numerics = {name: best.point[name] for name in self.along}
         for one in [*self.fitted.values()]:
-            if one.score < ruled_out < one.promise:
-                self.fit(one.names, one.point, [one.whiten])
-        return best
+            if self._strays(one, best) and one.promise > best.score - NEAR_BY:
+                self.fit(one.names, {**one.point, **numerics}, [one.whiten])
+        leading = max(self.fitted.values(), key=lambda one: one.score)
+        return self._with_less(leading) if self._is_better(leading, best) else best
+
+    def _strays(self, one: FittedSet, best: FittedSet) -> bool:
+        """Whether a set's numerics are elsewhere than the best set's."""
+        size = [abs(v - best.point[n][k]) for n in self.along for k, v in one.point[n].items()]
+        return max(size, default=0.0) > ASTRAY
 
     def forced(self, names: Names) -> FittedSet:
-        """A given set at its best; all sets with one effect less are fitted, too."""
+        """A given set at its best."""
         sets, levels = self.propose(self.nothing(), self.wanted)
         _, level, begin = self._likeliest(sets, names)
-        found = self.fit(names, begin, [levels[level]])
-        for out in names if len(names) > 1 else ():
-            rest = tuple(n for n in names if n != out)
-            self.fit(rest, without(found.point, out), [found.whiten])
+        return self._with_less(self.fit(names, begin, [levels[level]]))
+
+    def _with_less(self, found: FittedSet) -> FittedSet:
+        """A set, after all sets with one effect less are fitted, too: they judge what each effect takes."""
+        for out in found.names if len(found.names) > 1 else ():
+            rest = tuple(n for n in found.names if n != out)
+            if frozenset(rest) not in self.fitted:
+                self.fit(rest, without(found.point, out), [found.whiten])
         return found
 
     def nothing(self) -> FittedSet:
