@@ -4,9 +4,7 @@
 
 A FOLDER holds cases with labels.json next to them: those of another simulator, or those that
 `python -m experiments.blind_check open` draws. Diagnoses go to DIR/FOLDER/CASE.json, so that a run may be
-stopped and started again, and the rows of this run stand under NAME in FILE.json
-(experiments/results/gap_labs.json), next to those of other code. Nothing is sealed: what is changed by what
-comes out is judged on other cases.
+resumed, and the rows of this run stand under NAME in FILE.json (experiments/results/gap_labs.json).
 """
 
 from __future__ import annotations
@@ -91,20 +89,20 @@ def is_right(r: dict[str, Any]) -> bool:
 def reliability(rows: Sequence[dict[str, Any]], *verdicts: str) -> str:
     """Mean probability of what verdicts say, and how many are right."""
     of = [r for r in rows if r["verdict"] in verdicts and r.get("confidence") is not None]
-    if not of:
-        return ""
-    return f"{sum(r['confidence'] for r in of) / len(of):.2f}; {sum(map(is_right, of))} of {len(of)}"
+    return _said([(r["confidence"], is_right(r)) for r in of])
 
 
 def acted(rows: Sequence[dict[str, Any]], least: float, most: float) -> str:
     """Mean probability to act of effects with one from `least` to `most`, and how many do."""
-    of = [each for r in rows for each in r.get("acting", []) if least <= each[0] < most]
+    return _said([each for r in rows for each in r.get("acting", []) if least <= each[0] < most])
+
+
+def _said(of: Sequence[tuple[float, bool]]) -> str:
     return f"{sum(p for p, _ in of) / len(of):.2f}; {sum(true for _, true in of)} of {len(of)}" if of else ""
 
 
 def record(rows: Sequence[dict[str, Any]]) -> float:
-    """Share of the named that is right over the mean of its probabilities within the catalogue
-    (`simgap.attribution.verdict.RECORD` is taken off)."""
+    """Share of the named that is right over their mean probability before `RECORD` is taken off."""
     of = [r for r in rows if r["verdict"] in ("named", "set") and r["confidence"] is not None]
     return sum(map(is_right, of)) / max(sum(r["confidence"] for r in of) / RECORD, 1e-9)
 
@@ -160,21 +158,15 @@ def table(found: dict[str, Any]) -> str:
         ["seconds of processor, median",
          *(str(round(sorted(r["seconds"] for r in rows)[len(rows) // 2]) or "") for rows in runs.values())],
     ]  # fmt: skip
-    wrong = [
-        f"{r['case']} {'+'.join(r['effects'])} ({r['outcome']}{': ' if r['causes'] else ''}"
-        f"{'+'.join(r['causes'])})"
-        for r in list(runs.values())[-1]
-        if not is_right(r)
-    ]
-    return (
-        markdown(["figure", *runs], [each for each in lines if any(each[1:])])
-        + f"\n\nNot right by the last of these: {'; '.join(wrong) or 'none'}."
-    )
+    of = [r for r in list(runs.values())[-1] if not is_right(r)]
+    said = [": ".join(filter(None, (r["outcome"], "+".join(r["causes"])))) for r in of]
+    wrong = [f"{r['case']} {'+'.join(r['effects'])} ({what})" for r, what in zip(of, said, strict=True)]
+    shown = markdown(["figure", *runs], [each for each in lines if any(each[1:])])
+    return f"{shown}\n\nNot right by the last of these: {'; '.join(wrong) or 'none'}."
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Rows of one run over open labs, cases that are not there yet diagnosed first, and of the same cases
-    what labels say of other code (`said_by_COMMIT`)."""
+    """Rows of one run over open labs, and what labels say of other code (`said_by_COMMIT`)."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--results", type=Path, required=True)
@@ -202,12 +194,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         one = row(label, json.loads(file.read_text(encoding="utf-8")))
         runs.setdefault(options.run, []).append(one)
         print(*(one[k] for k in ("case", "effects", "outcome", "causes", "held_out")), flush=True)
-    file = options.output
     print(f"record of what is named: {record(runs[options.run]):.2f}")
     each = [one for r in runs[options.run] for one in r["acting"]]
     print(f"of causes: {ACTED * sum(true for _, true in each) / sum(p for p, _ in each):.2f}")
-    before = json.loads(file.read_text(encoding="utf-8"))["runs"] if file.exists() else {}
-    save(file, {"runs": before | runs})
+    old = json.loads(options.output.read_text(encoding="utf-8")) if options.output.exists() else {"runs": {}}
+    save(options.output, {"runs": old["runs"] | runs})
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def generate(
         if not part.exists():
             try:
                 trials = record_case(case, nominal, outside=outside)
-            except RuntimeError:  # no hand performs it: a set without this case
+            except RuntimeError:  # no hand performs it
                 continue
             write_folder(out / "cases" / case.name, case, trials, nominal)
             part.write_text(json.dumps(_label(case, trials)), encoding="utf-8")
