@@ -196,7 +196,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(*(one[k] for k in ("case", "effects", "outcome", "causes", "held_out")), flush=True)
     print(f"record of what is named: {record(runs[options.run]):.2f}")
     each = [one for r in runs[options.run] for one in r["acting"]]
-    print(f"of causes: {ACTED * sum(true for _, true in each) / sum(p for p, _ in each):.2f}")
+    print(f"of causes: {ACTED * sum(true for _, true in each) / max(sum(p for p, _ in each), 1e-9):.2f}")
     old = json.loads(options.output.read_text(encoding="utf-8")) if options.output.exists() else {"runs": {}}
     save(options.output, {"runs": old["runs"] | runs})
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import jax
 import numpy as np
@@ -25,6 +25,9 @@ class InfeasibleAlignment(ValueError):
         self.reason = reason
 
 
+Tree = TypeVar("Tree", bound="Leaves")
+
+
 class Leaves:
     """Base of pytrees whose children are the attributes named in `leaves`."""
 
@@ -38,7 +41,7 @@ class Leaves:
         return tuple(getattr(self, name) for name in self.leaves), None
 
     @classmethod
-    def tree_unflatten(cls, _: None, leaves: tuple) -> Any:
+    def tree_unflatten(cls: type[Tree], _: None, leaves: tuple) -> Tree:
         """An instance with these leaves, which may be any JAX values."""
         tree = object.__new__(cls)
         vars(tree).update(zip(cls.leaves, leaves, strict=True))

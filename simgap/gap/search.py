@@ -346,8 +346,10 @@ def _aligned_all(
         The trials, as they were if no candidate helps, and a warning that names the one that does.
     """
     shown = _shown(failed)
-    aligned = align(shown, failed.task, failed.rig, all_fit=True) if shown else failed
-    for _ in range(ROUNDS if shown else 0):
+    if not shown:
+        return failed, []
+    aligned = align(shown, failed.task, failed.rig, all_fit=True)
+    for _ in range(ROUNDS):
         given = problem(build(aligned), actual)
         healthy = fit(given, (), neutral(given))
         if healthy.cost > HOPELESS * given.size:
