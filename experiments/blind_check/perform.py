@@ -39,7 +39,7 @@ class Motion:
 
 
 def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
-    """Run a plan; ValueError if a grip fails or a block is lost."""
+    """Run a plan; ValueError if a grip fails, a block is lost or a finger meets a block at rest."""
     text = mjcf(blocks, plan.centres, tuple(plan.command[0]), world, plan.servos)
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
@@ -54,10 +54,10 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
     data.qpos[turns] = world.tilt  # blocks on a slope are inclined
     command, roll = plan.command[::EVERY], plan.roll[::EVERY]
     rows, law = len(command), _PadLaw(world)
-    bears = _bearings(model, names)
+    bears, grips = _bearings(model, names), _grips(model, names)
     q_log, v_log = np.empty((rows, model.nq)), np.empty((rows, model.nv))
     pad_log, a_log = np.empty((rows, 4)), np.empty((rows, 4))
-    stands = np.zeros((rows, len(names)), bool)
+    stands, touched = np.zeros((rows, len(names)), bool), np.zeros((rows, len(names)), bool)
     for _ in range(round(SETTLE / STEP)):
         data.ctrl[:] = command[0]
         law.push(data, pads)
@@ -74,6 +74,8 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
             k = bears[a, b]
             if k >= 0:
                 stands[r, k] = True
+            if grips[a, b] >= 0:
+                touched[r, grips[a, b]] = True
         if law.needed:
             for _ in range(EVERY - 1):
                 law.push(data, pads)
@@ -85,7 +87,9 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
     t = np.arange(rows) * STEP * EVERY
     start = np.array([plan.centres[b] for b in names])
     centres = np.stack([q_log[:, c] for c in cubes], 1) + start
-    boundaries = _boundaries(t, force, stands, centres, [names.index(b) for b in plan.moved])
+    moved = [names.index(b) for b in plan.moved]
+    boundaries = _boundaries(t, force, stands, centres, moved)
+    _check_touches(t, touched, boundaries[3::4], moved)
     return Motion(t, q_log[:, fingers], v_log[:, fingers], force, boundaries, centres, q_log[:, turns])
 
 
@@ -103,6 +107,26 @@ def _bearings(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
                     out[geoms[f"top{end}_{other}"], geoms[f"box_{name}"]] = k
                     out[geoms[f"box_{name}"], geoms[f"top{end}_{other}"]] = k
     return out
+
+
+def _grips(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
+    """For each pair of geoms, the block that a pad touches there, or -1."""
+    out = np.full((model.ngeom, model.ngeom), -1)
+    for k, name in enumerate(names):
+        box = model.geom(f"box_{name}").id
+        for tip in (model.geom(f"tip{i}{e}").id for i in (1, 2) for e in "ab"):
+            out[tip, box] = out[box, tip] = k
+    return out
+
+
+def _check_touches(t: np.ndarray, touched: np.ndarray, parts: tuple[float, ...], moved: list[int]) -> None:
+    """ValueError if a pad touches a block that is neither the one to be moved nor the one just let go."""
+    move = np.searchsorted(parts, t)
+    before, after = [moved[0], *moved], [*moved, moved[-1]]
+    for k in range(touched.shape[1]):
+        strange = (np.take(before, move) != k) & (np.take(after, move) != k)
+        if (touched[:, k] & strange).any():
+            raise ValueError("a finger met another block")
 
 
 class _PadLaw:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-STEP = 0.0005  # s
+STEP = 0.00025  # s; at twice that, a stiff pad that can turn chatters through a whole carry
 TIP, TIP_MASS = 0.003, 0.01  # m, kg; the pad's inertia is taken out of what it feels
 PAD = 0.003  # m from the middle of a pad to its upper and lower end
 PAD_INERTIA = 2e-6  # kg m^2; lighter pads would want shorter steps

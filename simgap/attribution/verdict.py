@@ -314,11 +314,17 @@ def _step(rows: Rows) -> float:
 
 
 def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray) -> tuple[Cell, ...]:
-    """Cells whose squares exceed the noise, largest share first (Benjamini & Hochberg, JRSS B 57, 1995)."""
+    """Cells whose squares exceed the noise (Benjamini & Hochberg, JRSS B 57, 1995), largest share first.
+
+    A long cell shows a gap that is a fraction of its noise; such cells are listed only if no cell's gap is as
+    large as its noise.
+    """
     key, energy, count = tallied(rows, band, left, noise)
     chance = chi2.sf(energy, count)
-    listed = np.flatnonzero(false_discovery_control(np.clip(chance, 0, 1), method="bh") < RATE)
+    shown = false_discovery_control(np.clip(chance, 0, 1), method="bh") < RATE
     excess = np.maximum(energy - count, 0.0)
+    large = shown & (excess >= count)
+    listed = np.flatnonzero(large if large.any() else shown)
     total = max(float(excess[listed].sum()), 1e-12)
     edges = (*rows.bands, 0.5 / _step(rows))
     out = []
