@@ -316,14 +316,15 @@ def _step(rows: Rows) -> float:
 def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarray) -> tuple[Cell, ...]:
     """Cells whose squares exceed the noise (Benjamini & Hochberg, JRSS B 57, 1995), largest share first.
 
-    A long cell shows a gap that is a fraction of its noise; such cells are listed only if no cell's gap is as
-    large as its noise.
+    A long cell shows a gap that is a fraction of a sample's noise; such cells are listed only if no cell's
+    gap is as large as the noise, in mean square over its samples.
     """
     key, energy, count = tallied(rows, band, left, noise)
     chance = chi2.sf(energy, count)
     shown = false_discovery_control(np.clip(chance, 0, 1), method="bh") < RATE
-    excess = np.maximum(energy - count, 0.0)
-    large = shown & (excess >= count)
+    excess = np.where(shown, energy - count, 0.0)
+    _, cell = np.unique(key // len(rows.bands), return_inverse=True)
+    large = shown & (np.bincount(cell, excess) >= np.bincount(cell, count))[cell]
     listed = np.flatnonzero(large if large.any() else shown)
     total = max(float(excess[listed].sum()), 1e-12)
     edges = (*rows.bands, 0.5 / _step(rows))
