@@ -19,6 +19,7 @@ docs/segmentation.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -85,6 +86,17 @@ class Features(Brief):
     def usual(self) -> dict[str, float]:
         """Median noise of `d` and `y` [m]."""
         return {"d": float(np.median(self.sd_d)), "y": float(np.median(self.sd_y))}
+
+    @cached_property
+    def resolution(self) -> float:
+        """Standard deviation [N] of what rounding of the forces to a step adds; about 0 without one.
+
+        Nearly all small changes between readings are one step then, so that most readings of a free finger
+        are the same, and no scale can be learned from them.
+        """
+        change = np.abs(np.diff(self.force, axis=0))
+        change = change[change > 0]
+        return float(np.quantile(change, 0.1)) / math.sqrt(12) if change.size else 0.0
 
     @cached_property
     def carrying(self) -> np.ndarray:

@@ -48,6 +48,7 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
     free = force[~held]
     bias = np.nan_to_num(np.nanmedian(free, axis=0))
     noise = float(np.nanmedian(NORMAL * np.nanmedian(np.abs(free - bias), axis=0)))
+    noise = max(noise, _least_force(features))
     fy = force[:, 1] + force[:, 3] - bias[1] - bias[3]
     known = held & np.isfinite(speed)
     moving = known & (speed > np.median(speed[known])) if known.any() else held
@@ -56,10 +57,15 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
     weight = max(float(np.median(lifted)) if lifted.size else 0.0, 3 * noise, 0.01 * span)
     names = [str(s.object) for s in subtasks if s.state != FREE]  # in order: sums round differently otherwise
     scale = {
-        "force": max(noise, 1e-6), "carry": 0.3 * weight, "net_x": 0.1 * span, "shear": 0.1 * span,
+        "force": noise, "carry": 0.3 * weight, "net_x": 0.1 * span, "shear": 0.1 * span,
         "velocity": 0.01, "level": 1e-3, "width": 1e-3,
     }  # fmt: skip
     return Parameters(bias, dict.fromkeys(names, weight), scale)
+
+
+def _least_force(features: Sequence[Features]) -> float:
+    """Least noise [N] of a force: what rounding adds, in the median trial."""
+    return max(float(np.median([f.resolution for f in features])), 1e-6)
 
 
 def chain_of(shares: np.ndarray, length: int) -> Chain:
@@ -128,7 +134,7 @@ def maximisation(features: Sequence[Features], subtasks: tuple[Subtask, ...],
             weight[name] = max(_location(fy / factor, gamma, old.scale["carry"], old.weight[name]), 1e-3)
             residual = np.where(gamma > 0.5, fy - weight[name] * factor, residual)
     scale = {
-        "force": _scale(unbiased.ravel(), np.repeat(free, 4), noise, 1e-6),
+        "force": _scale(unbiased.ravel(), np.repeat(free, 4), noise, _least_force(features)),
         "carry": _scale(residual, above, old.scale["carry"], noise),
         "net_x": _scale(net_x, above + ground, old.scale["net_x"], noise),
         "shear": _scale(shear, above + ground, old.scale["shear"], noise),

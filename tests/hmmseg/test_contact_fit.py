@@ -291,6 +291,18 @@ def test_planted_parameters_are_recovered_from_wrong_starts(wrong, monkeypatch):
     check_recovery(fit([f for f, _ in trials], STEPS), trials)
 
 
+def test_a_scale_is_not_learned_from_readings_that_rounding_makes_equal():
+    trial, labels = planted(1, replace(PLANTED, bias=(0.0,) * 4))
+    step = 5 * PLANTED.noise
+    rounded = replace(trial, force=step * np.round(trial.force / step))
+    assert np.mean(rounded.force[labels == 0] == 0) > 0.9
+    assert rounded.resolution == pytest.approx(step / np.sqrt(12))
+    found = fit([rounded], STEPS)
+    assert found.parameters.scale["force"] == pytest.approx(step / np.sqrt(12))
+    assert np.mean(np.asarray(found.posteriors[0].path) == labels) > 0.95
+    assert trial.resolution < 0.3 * PLANTED.noise
+
+
 def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():
     rng = np.random.default_rng(5)
     gammas = [rng.dirichlet(np.ones(4), size=n) * [1, 1, 1, 0] for n in (30, 50)]  # a subtask nobody saw
