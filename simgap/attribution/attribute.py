@@ -384,16 +384,21 @@ def _needed(f: Forms, model: Model, effect: int) -> bool:
     """Whether an effect of a set is needed.
 
     Its evidence must exceed RULED_OUT and what errors in the forms of the other effects may imitate: a share
-    of what the residuals say for the set, not of evidence from other sources. A single effect is needed if
-    there is a gap.
+    of what the residuals say for the set, not of evidence from other sources, divided among them by what each
+    of them adds. A single effect is needed if there is a gap.
     """
     others = tuple(j for j in model.effects if j != effect)
     if not others:
         return True
     of = [f.gap.candidates[j] for j in others]
+
+    def added(j: int) -> float:
+        return model.score - fitted(f, tuple(i for i in model.effects if i != j)).score
+
     shown = model.score - fitted(f, ()).score - sum(max(c.evidence, 0.0) for c in of)
-    feigned = max(c.form for c in of) * shown
-    return bool(model.score - fitted(f, others).score > max(np.log(RULED_OUT), feigned))
+    parts = np.maximum([added(j) for j in others], np.log(RULED_OUT))
+    feigned = shown * np.average([c.form for c in of], weights=parts)
+    return bool(added(effect) > max(np.log(RULED_OUT), feigned))
 
 
 def _effects(

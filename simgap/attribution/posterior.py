@@ -140,6 +140,7 @@ def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
 
 STEPS = 30  # numerics: most iterations
 CLOSE = 0.02  # numerics: nats
+HALVINGS = 12  # numerics: of a step that leads down
 
 
 @dataclass(frozen=True)
@@ -384,12 +385,18 @@ def mode(
             prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
         matrix, pull = taken.weighed(precision)
         matrix[np.diag_indices(size)] += prior
-        x, held = least(matrix, pull, taken.low, taken.high)
-        energy = taken.energy(x)
-        density, precision = f.marginal(taken.effects, energy)
-        last, value = value, float(density.sum()) + _log_prior(x, z, taken.blocks)
-        if abs(value - last) < CLOSE:
+        last, before, (x, held) = value, x, least(matrix, pull, taken.low, taken.high)
+        # Without what noise adds, squares of a group may fall below zero far away, and a step lead nowhere.
+        for _ in range(HALVINGS):
+            energy = taken.energy(x)
+            density, precision = f.marginal(taken.effects, energy)
+            value = float(density.sum()) + _log_prior(x, z, taken.blocks)
+            if value > last - CLOSE:
+                break
+            x = (before + x) / 2
+        if value - last < CLOSE:
             break
+    held &= (x <= taken.low) | (x >= taken.high)
     for mine in taken.blocks.values():
         prior[mine] = (1 + mine.size) / (1 + x[mine] @ x[mine])
     matrix = taken.weighed(precision)[0] + np.diag(prior)
