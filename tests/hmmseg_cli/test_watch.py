@@ -49,6 +49,7 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
         (lambda rows: [*rows[:5], "1,2,3", *rows[6:]], "row 6: has 3 cells; expected 13"),
         (lambda rows: [*rows[:5], "," + rows[5].split(",", 1)[1], *rows[6:]], "row 6, column t: missing"),
         (lambda rows: [], "standard input: is empty"),
+        (lambda rows: rows[:1], "the stream: has no rows; expected a row for every sample"),
         (
             lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
             "row 6, column fy2: 1e+300 is no",
