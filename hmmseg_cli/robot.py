@@ -247,8 +247,12 @@ def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], o
     out.print(sentence(document), *usual_tables(document))
     _deliver(out, own, found, document, loaded, logs[: len(paths)], effects)
     if own.patch is not None:
-        point = {n: v for n, v in found.point().items() if not found.composed.effects[n].numeric}
-        _patch(out, own, found.composed, point, document, document["causes"])
+        whole, causes, best = found.composed, document["causes"], found.calibration
+        point = {n: v for n, v in found.point().items() if not whole.effects[n].numeric}
+        changed = {whole.effects[c].label(p) for c in causes for p in whole.effects[c].parameters}
+        fitted = {} if best is None else document["calibrated"]["parameters"]
+        ranges = document | {"parameters": {n: p for n, p in fitted.items() if n not in changed}}
+        _patch(out, own, whole, point, ranges, [*causes, *([] if best is None else _fitted(best))])
     out.finish(document)
 
 
