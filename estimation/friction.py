@@ -63,8 +63,8 @@ def ground_friction(
         square = 1 / (right**2).sum(axis=1)
         mean = (right * pushed).sum(axis=1) * square
         left = (pushed - mean[:, None] * right).mean(axis=0)
-    sd = np.sqrt(square * (left @ left) / max(push.size - 3, 1))
-    draws = mean + sd * rng.standard_normal(DRAWS)
+    freedom = max(push.size - 3, 1)  # few where a slide is short
+    draws = mean + np.sqrt(square * (left @ left) / freedom) * rng.standard_t(freedom, DRAWS)
     return GroundFriction(support, draws) if 0 < draws.std() < WIDEST * draws.mean() else None
 
 

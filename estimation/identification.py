@@ -179,8 +179,9 @@ def identify_aligned(
         warnings += predictive.warnings
         notes = [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
         contradicted = contradictions(aligned, weighed, design)
-        reasons |= contradicted | impossible(design, sampled)
-        kept = [i for i, u in enumerate(design.unknowns) if not (set(u.properties) & set(reasons))]
+        rejected = contradicted | impossible(design, sampled)
+        reasons |= rejected
+        kept = [i for i, u in enumerate(design.unknowns) if not rejected.keys() & set(u.properties)]
         centres = {u.name: float(sampled.flat[:, i].mean()) for i, u in enumerate(design.unknowns)
                    if u.single and i not in sampled.impossible}  # fmt: skip
     elif sampled is not None:
@@ -247,8 +248,11 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
 
 
 def source_subtasks(described: Decomposition, obj: str, prop: str) -> list[str]:
-    """Names of the subtasks whose samples determine this property, such as `carry block1`."""
-    evidence = described.properties[obj][prop].evidence
+    """Names of the subtasks whose samples determine this property, such as `carry block1`.
+
+    A weight is not taken from a slide, which shows it only under a condition.
+    """
+    evidence = [e for e in described.properties[obj][prop].evidence if e.condition is None]
     return list(dict.fromkeys(described.subtasks[k].label for one in evidence for k in one.subtasks))
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from estimation.design import Unknown
 from hmmseg.contact import decompose
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.schema import read_toml
@@ -146,10 +147,14 @@ def property_rows(body: dict[str, Any], measured: Actual | None = None) -> list[
     """One row per property as text: estimate, intervals, measured value, deviation, and its source.
 
     `deviation`: of the estimate from the measured value in per cent; `from`: the subtasks that determine it,
-    or why it is unknown.
+    or why it is unknown. What only a combination of properties is determined for comes last.
     """
-    rows = []
-    for obj, prop, entry in ((o, p, e) for o, own in body["properties"].items() for p, e in own.items()):
+    rows, entries = [], [(o, p, e) for o, own in body["properties"].items() for p, e in own.items()]
+    for one in body.get("combinations", ()):
+        terms = {key.rpartition(".")[0]: number for key, number in one["of"].items()}
+        unknown = Unknown(next(iter(one["of"])).rpartition(".")[2], terms)
+        entries.append((*unknown.name, one))
+    for obj, prop, entry in entries:
         shown, compared = SHOWN[prop], body.get("actual", {}).get(obj, {}).get(prop, {})
         row = dict.fromkeys(("estimate", *INTERVALS, "measured", "deviation", "from"), "")
         row |= {"block": obj, "property": prop, "estimate": "unknown"}

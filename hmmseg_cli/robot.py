@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from simgap.progress import Progress
     from simgap.robot_effects.base import RobotEffect
+    from simgap.robots.calibrate import Calibration
     from simgap.robots.changes import Changes
     from simgap.robots.diagnose import RobotDiagnosis
     from simgap.simulators.mjcf.load import Loaded
@@ -160,7 +161,6 @@ def calibrate(
         own.check_alone({})
         from simgap.robots.calibrate import STAGES
         from simgap.robots.calibrate import calibrate as fit
-        from simgap.robots.patch import write_patch
 
         robot, recordings, loaded = read_logs(out, distinct_trials(logs), own)
         length = getattr(robot, "window", None) if loaded is None else loaded.map.length
@@ -172,9 +172,7 @@ def calibrate(
         reasons = (f"{name}: {reason}" for name, reason in document["reasons"].items())
         out.print(*_calibration_tables(document), *reasons)
         if patch is not None:
-            changed = [n for n in found.point if not found.composed.effects[n].numeric]
-            given = found.composed, found.point, document, changed, model
-            write_patch(*given, lambda name: out.stage(patch / name))
+            _patch(out, own, found.composed, found.point, document, _fitted(found))
         out.finish(document)
 
 
@@ -228,9 +226,8 @@ def diagnose_robot(
     if own.patch is not None:
         corrected = found.composed, found.linear.point, document, document["causes"]
         if document["verdict"] == "unknown" and found.calibrated is not None:  # then the best model there is
-            whole, point = found.calibrated.composed, found.calibrated.point
-            moved = [n for n in point if not whole.effects[n].numeric]
-            corrected = whole, point, document["calibrated"], moved
+            best = found.calibrated
+            corrected = best.composed, best.point, document["calibrated"], _fitted(best)
         _patch(out, own, *corrected)
     out.finish(document)
 
@@ -250,9 +247,18 @@ def compare_robot(out: Output, paths: Sequence[Path], healthy: Sequence[Path], o
     out.print(sentence(document), *usual_tables(document))
     _deliver(out, own, found, document, loaded, logs[: len(paths)], effects)
     if own.patch is not None:
-        point = {n: v for n, v in found.point().items() if not found.composed.effects[n].numeric}
-        _patch(out, own, found.composed, point, document, document["causes"])
+        whole, causes, best = found.composed, document["causes"], found.calibration
+        point = {n: v for n, v in found.point().items() if not whole.effects[n].numeric}
+        changed = {whole.effects[c].label(p) for c in causes for p in whole.effects[c].parameters}
+        fitted = {} if best is None else document["calibrated"]["parameters"]
+        ranges = document | {"parameters": {n: p for n, p in fitted.items() if n not in changed}}
+        _patch(out, own, whole, point, ranges, [*causes, *([] if best is None else _fitted(best))])
     out.finish(document)
+
+
+def _fitted(found: Calibration) -> list[str]:
+    """Effects that were fitted, without the solver's own numbers."""
+    return [n for n in dict.fromkeys(n for n, _ in found.names) if not found.composed.effects[n].numeric]
 
 
 def _patch(out: Output, own: OwnSimulator, composed: Any, point: Any, document: Any, causes: Any) -> None:

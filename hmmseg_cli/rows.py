@@ -36,6 +36,7 @@ class Rows:
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
         self._stream, self._number = stream, 0
+        self.notes: list[str] = []  # about the end of the stream
         header = _text(self._line()).strip()
         if not header:
             raise InputError(WHERE, "is empty", "a CSV header with a column t, then rows")
@@ -73,6 +74,9 @@ class Rows:
             self._first = False
             if self._take_units(cells_of(_text(line).rstrip("\r\n"), self._separator)):
                 return self.next()
+        if len(cells) < self._num and not line.endswith((b"\n", b"\r")):
+            self.notes.append(f"{WHERE}: row {self._number}, the last, is cut off and left out")
+            return None
         if len(cells) != self._num:
             raise InputError(
                 f"{WHERE}: row {self._number}", f"has {len(cells)} cells", f"{self._num} as in the header"

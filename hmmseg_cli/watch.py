@@ -58,6 +58,7 @@ def watch(
             if show is not None:
                 show.close()
         final = watcher.finish()
+        out.warn(*rows.notes)
         for key, text in COUNTED.items():
             if watcher.counts[key]:
                 out.warn(f"{watcher.counts[key]} {text}")

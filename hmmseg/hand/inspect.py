@@ -286,7 +286,8 @@ def split_names(names: Sequence[str]) -> dict[str, list[str]]:
 def _channel_meant(words: list[str]) -> str | None:
     """Our channel (with z for a third axis) that the words of a name mean; None if they mean none."""
     known = set(words)
-    finger = "1" if known & LEFT else "2" if known & RIGHT else None
+    sides = ("1" if word in LEFT else "2" for word in sorted(words, key=str.isdigit) if word in LEFT | RIGHT)
+    finger = next(sides, None)  # a side outweighs a number, and of two numbers the first is the finger
     if finger is None or known & TURNING:
         return None
     quantity = next((name for name, words_ in QUANTITIES.items() if known & words_), None)

@@ -192,7 +192,9 @@ class Watcher:
         return self._odd("late", t, newest - t, self.lag)
 
     def finish(self) -> Answer:
-        """The final answer, with all boundaries settled whatever their age."""
+        """The final answer, with all boundaries settled whatever their age; InputError if no row came."""
+        if not self.counts["rows"]:
+            raise InputError("the stream", "has no rows", "a row for every sample")
         if self._wrist is not None:
             self._forward(self._wrist, self._wrist.ready(final=True))
         return self.filter.finish()

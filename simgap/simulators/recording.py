@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hmmseg.errors import InputError
+from hmmseg.errors import InputError, nearest
 from hmmseg.hand.plausibility import check_clock
 from hmmseg.io.formats import read_table
 from hmmseg.io.formats.logs import interpolated
@@ -74,6 +74,9 @@ def read_recording(
     clock = {"t": Column.model_validate({"from": times, "unit": unit})}
     rig = Rig.model_construct(columns=clock, topics=clock if times != "t" else {})
     table = read_table(path, [times, *names])
+    if times not in table.names:
+        expected = f'times in s, or time = "..." in map.toml, {nearest(times, table.names)}'
+        raise InputError(f"{path}: column {times}", "missing", expected)
     trial = trial_of(table, rig, SequenceTask(("all",), channels=names))
     for finding in check_clock(trial, None):
         if finding.certain:

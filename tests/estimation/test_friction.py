@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from estimation.friction import FrictionPosterior, Stretch, friction_posteriors, largest_ratio, slip_evidence
+from estimation.friction import (
+    FrictionPosterior,
+    Stretch,
+    friction_posteriors,
+    ground_friction,
+    largest_ratio,
+    slip_evidence,
+)
 from estimation.observations import WeighedTrial, subtask_masks
 from hmmseg.contact.decompose import FREE, subtasks
 from hmmseg.hand.signals import Signals
@@ -220,3 +227,19 @@ def test_sliding_tells_the_friction_of_the_support(task, close):
         assert ground.mu_draws.mean() == pytest.approx(mu, abs=close)
         z.append((ground.mu_draws.mean() - mu) / ground.mu_draws.std())
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 2.0
+
+
+def test_intervals_hold_however_few_samples_a_slide_has(monkeypatch):
+    """Six samples and three unknowns leave three to judge the noise by."""
+    rng, mu, weight, inside = np.random.default_rng(3), 0.5, 0.6, []
+    down, lag = 0.3 * np.linspace(-1, 1, 6), 0.05 * np.array([1, -1, 0, 0, -1, 1])
+    for _ in range(400):
+        push = mu * (weight - down) + weight * lag + 0.01 * rng.standard_normal(6)
+        monkeypatch.setattr("estimation.friction._rows", lambda *_, p=push: np.stack([p, lag, down], axis=1))
+        found = ground_friction(
+            [planted(SLID, np.zeros(100), rng)], SLID, subtasks(SLID), "cup", RIG, None, rng
+        )
+        assert found is not None
+        low, high = np.percentile(found.mu_draws, [2.5, 97.5])
+        inside.append(low < mu < high)
+    assert np.mean(inside) > 0.92

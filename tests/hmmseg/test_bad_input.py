@@ -306,8 +306,10 @@ def test_streams(lines):
         row = one_line(rows.next)
         if row is not None:
             strict(watcher.update(*row).line())
-    if watcher.counts["rows"]:
-        strict(watcher.finish().line())
+    final = one_line(watcher.finish)
+    assert (final is None) == (not watcher.counts["rows"])
+    if final is not None:
+        strict(final.line())
 
 
 def strict(line):

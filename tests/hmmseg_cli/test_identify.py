@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from estimation.report import property_rows
 from hmmseg.example import example_folder
 from hmmseg_cli.main import main
 
@@ -102,6 +103,41 @@ def test_what_the_task_cannot_tell_is_null_with_the_reason(tmp_path):
     assert found["properties"]["block1"]["height"] is None
     assert found["reasons"]["block1.height"]
     assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.343, rel=0.03)
+
+
+def test_sums_stand_where_their_terms_do_not(tmp_path):
+    """Three blocks restacked show only sums of heights; a block that only slides shows no weight."""
+    true = {"a": (0.4, 0.04, 0.03), "b": (0.9, 0.05, 0.025), "c": (1.4, 0.06, 0.04)}
+    units = {"weight": "N", "width": "m", "height": "m"}
+    entries = ((o, *entry) for o, own in true.items() for entry in zip(units.items(), own, strict=True))
+    actual, tower, pushed = tmp_path / "actual.toml", tmp_path / "tower.toml", tmp_path / "pushed.toml"
+    actual.write_text("".join(f'[{o}.{p}]\nunit = "{unit}"\nvalue = {v}\n' for o, (p, unit), v in entries))
+    stands = "".join(f'[objects.{o}]\non = "{on}"\n' for o, on in (("a", "b"), ("b", "c"), ("c", "ground")))
+    moves = [
+        f'[[moves]]\nobject = "{o}"\nto = "{to}"\n' for o, to in (("a", "ground"), ("b", "a"), ("c", "b"))
+    ]
+    tower.write_text(stands + "".join(moves))
+    pushed.write_text(stands + moves[0] + '[[moves]]\nobject = "b"\nto = "c"\nslide = true\n')
+    found = {}
+    for task in (tower, pushed):
+        args = ("--task", str(task), "--rig", str(NONE / "rig.toml"))
+        made = tmp_path / task.stem
+        simulate = ["simulate", *args, "--properties", str(actual), "--output", str(made), "--quiet"]
+        assert main(simulate) == 0
+        found[task.stem] = document(
+            "identify", str(made / "trial_01.csv"), *args, out=tmp_path / f"{task.stem}.json"
+        )
+    sums = {tuple(one["of"]): one for one in found["tower"]["combinations"]}
+    assert sums.keys() == {("b.height", "c.height"), ("a.height", "b.height")}
+    for names, one in sums.items():
+        assert all(found["tower"]["properties"][name[0]]["height"] is None for name in names)
+        assert "only together" in found["tower"]["reasons"][names[0]]
+        true_sum = sum(true[name[0]][2] for name in names)
+        assert abs(one["mean"] - true_sum) < 4 * one["sd"] < 0.001
+    shown = {(row["block"], row["property"]): row["estimate"] for row in property_rows(found["tower"])}
+    assert shown["b + c", "height"].startswith("6.5") or shown["b + c", "height"].startswith("6.4")
+    assert found["pushed"]["trials"][0]["complete"] and found["pushed"]["properties"]["b"]["weight"] is None
+    assert found["pushed"]["reasons"]["b.weight"] == "no subtask of this task lifts b"
 
 
 def test_an_object_that_the_task_does_not_name_is_said(tmp_path):

@@ -117,6 +117,12 @@ def test_nothing_is_proposed_where_nothing_is_needed(case):
          {"t": "timestamp", "x1": "finger1.tip.x", "y1": "finger1.tip.z", "fx1": "finger1.force.x",
           "fy1": "finger1.force.z", "x2": "finger2.tip.x", "y2": "finger2.tip.z", "fx2": "finger2.force.x",
           "fy2": "finger2.force.z"}),
+        (["t", "right_joint_1", "right_joint_2", "left_joint_1", "left_joint_2", "F1x", "F1y", "F2x", "F2y"],
+         {"q21": "right_joint_1", "q22": "right_joint_2", "q11": "left_joint_1", "q12": "left_joint_2",
+          "fx1": "F1x", "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
+        (["t", "joint1_1", "joint1_2", "joint2_1", "joint2_2", "F1x", "F1y", "F2x", "F2y"],
+         {"q11": "joint1_1", "q12": "joint1_2", "q21": "joint2_1", "q22": "joint2_2", "fx1": "F1x",
+          "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
         (["t", "temperature", "pressure"], {}),
     ],
 )  # fmt: skip

@@ -21,8 +21,8 @@ COMMAND = ["watch", "--task", str(CASE / "task.toml"), "--rig", str(CASE / "rig.
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    def run(rows, *options):
-        text = io.TextIOWrapper(io.BytesIO("\n".join(rows).encode() + b"\n"))
+    def run(rows, *options, end="\n"):
+        text = io.TextIOWrapper(io.BytesIO(("\n".join(rows) + end).encode()))
         monkeypatch.setattr(sys, "stdin", text)
         code = main([*COMMAND, *options])
         out, err = capsys.readouterr()
@@ -49,6 +49,7 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
         (lambda rows: [*rows[:5], "1,2,3", *rows[6:]], "row 6: has 3 cells; expected 13"),
         (lambda rows: [*rows[:5], "," + rows[5].split(",", 1)[1], *rows[6:]], "row 6, column t: missing"),
         (lambda rows: [], "standard input: is empty"),
+        (lambda rows: rows[:1], "the stream: has no rows; expected a row for every sample"),
         (
             lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
             "row 6, column fy2: 1e+300 is no",
@@ -85,6 +86,16 @@ def test_bad_rows_can_be_left_out(run):
     code, lines, err = run(rows, "--skip-bad-rows")
     assert code == 0 and len(lines) == 20
     assert "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
+
+
+def test_a_stream_that_ends_in_the_middle_of_a_row(run):
+    """As a file that does: the row is left out with a warning, and the last line is written."""
+    code, lines, err = run([*ROWS[:20], ROWS[20][:30]], end="")
+    assert code == 0 and len(lines) == 20 and lines[-1]["final"] and lines[-1]["counts"]["rows"] == 19
+    assert lines[-1]["warnings"] == ["standard input: row 21, the last, is cut off and left out"]
+    assert lines[-1]["warnings"][0] in err
+    whole = run(ROWS[:20], end="")[1]
+    assert whole[-1]["counts"] == lines[-1]["counts"] and whole[-1]["segments"] == lines[-1]["segments"]
 
 
 def test_the_live_picture_shows_where_the_task_is():

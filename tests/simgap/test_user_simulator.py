@@ -171,8 +171,10 @@ def test_logs_with_their_own_name_for_time(tmp_path):
     path.write_text("stamp,y\n" + "".join(f"{0.1 * i},{i}\n" for i in range(10)))
     log = read_recording(path, ["y"], "stamp")
     assert log.t[3] == pytest.approx(0.3) and log["y"][3] == 3 and log.name == "log.csv"
-    with pytest.raises(InputError, match=r"log\.csv: column time: missing"):
-        read_recording(path, ["y"], "time")
+    for absent in ("time", "t"):  # a robot has no rig.toml
+        told = rf'column {absent}: missing; expected times in s, or time = ".+" in map.toml, one of stamp, y'
+        with pytest.raises(InputError, match=told):
+            read_recording(path, ["y"], absent)
     with pytest.raises(InputError, match=r"log\.csv: column z: missing"):
         read_recording(path, ["z"], "stamp")
     path.write_text("t,y\n" + "".join(f"{0.1 * (i if i != 5 else 3)},{i}\n" for i in range(10)))
