@@ -37,7 +37,7 @@ from simgap.robots.sets import (
     without,
 )
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
-from simgap.robots.windows import STRIKES
+from simgap.robots.windows import JUMPS, STRIKES
 from simgap.simulators.protocol import Parameter
 
 EXPECTED = 1.0  # prior: how many of all candidates act
@@ -265,10 +265,9 @@ class Search:
         for whiten in scales:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
-                before = one.score
-                if one.promise < max(before + BETTER, rival - NEAR):
+                before, (there, bend) = one.score, self._begun_anew(one)
+                if max(one.promise, before + bend) < max(before + BETTER, rival - NEAR):
                     break
-                there = self.composed.moved(one.point)
                 again = self._judge(there, names, self._fit_point(there, one.point, one.whiten))
                 one = max((one, again), key=lambda fitted: fitted.score)
                 if one.score < before + BETTER:
@@ -281,8 +280,22 @@ class Search:
             self.fitted[key] = best
         return self.fitted[key]
 
+    def _begun_anew(self, one: FittedSet) -> tuple[Composed, float]:
+        """The model about a set's fit, with windows run from where that puts their starts; and by how much
+        straight lines from where they were run from are wrong there [nats]."""
+        composed, linear, asides = one.composed, one.linear, {}
+        for k, sizes in one.covariances.starts(one.whiten, np.nan_to_num(linear.residual)).items():
+            away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
+            asides[k] = {n: float(doubt * size) for (n, doubt), size in away if n != JUMPS}
+        if not any(asides.values()):
+            return composed.moved(one.point), 0.0
+        there = composed.run_aside(asides)
+        off = linearise(there, one.point, [], linear.starts).residual - linear.residual
+        return there.moved(one.point), 0.5 * float(np.sum(one.whiten(np.nan_to_num(off)) ** 2))
+
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
-        linear = linearise(composed, begin, [], self._starts)
+        aside = any(w.aside for w in composed.windows)
+        linear = linearise(composed, begin, [], None if aside else self._starts)
         return fit_effects(composed, linear, whiten, begin)
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
