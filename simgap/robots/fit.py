@@ -183,7 +183,7 @@ class _Squares:
         base, columns = self.base(x), []
         for effect in self.free:
             step = self._step(effect)
-            moved = vary(self.composed, base, self.linear.starts, effect, step=step, shifted=False)
+            moved = vary(self.composed, base, effect, step=step, shifted=False)
             size = len(self.composed.effects[effect].parameters)
             white = np.zeros((self.linear.residual.size, size))
             if moved is not None:

@@ -120,7 +120,7 @@ class Composed:
     def run_aside(self, asides: Mapping[int, Mapping[str, float]]) -> Composed:
         """The same with windows, by number, run that far aside of their starts."""
         windows = [replace(w, aside=asides[k]) if k in asides else w for k, w in enumerate(self.windows)]
-        return replace(self, windows=tuple(windows), _slopes={})
+        return replace(self, windows=tuple(windows))
 
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
         """Roll out every window.

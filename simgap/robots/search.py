@@ -123,7 +123,6 @@ class Search:
     columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
-    _starts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)  # of the empty set: steers fits
     _proposed: dict = field(default_factory=dict, repr=False)
     _densities: dict[tuple[FittedSet, Whitener], np.ndarray] = field(default_factory=dict, repr=False)
 
@@ -191,7 +190,6 @@ class Search:
             every = linearise(self.composed, point, [*self.along, *self.wanted])
             self.composed = with_wobble(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
-        self._starts = dict(linear.starts)
         return self.fit((), point, [covariances(self.composed, linear).whitener()])
 
     def _from(self, best: FittedSet, tell: Progress) -> FittedSet:
@@ -294,8 +292,7 @@ class Search:
         return there.moved(one.point), 0.5 * float(np.sum(one.whiten(np.nan_to_num(off)) ** 2))
 
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
-        aside = any(w.aside for w in composed.windows)
-        linear = linearise(composed, begin, [], None if aside else self._starts)
+        linear = linearise(composed, begin, [], None if any(w.aside for w in composed.windows) else {})
         return fit_effects(composed, linear, whiten, begin)
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
@@ -353,7 +350,7 @@ class Search:
                 if name not in self.columns:
                     say(f"what {name} would do")
                     size = np.full(len(composed.effects[name].parameters), USUAL)
-                    self.columns[name] = vary(composed, base, linear.starts, name, step=size)
+                    self.columns[name] = vary(composed, base, name, step=size)
                 one = self.columns[name]
                 more |= {} if one is None else {name: one}
         linear = linear.with_moved(more)
@@ -434,7 +431,7 @@ class Search:
                 near = {
                     n: p.nominal + (p.sd if p.nominal + p.sd <= p.high else -p.sd) for n, p in known.items()
                 }
-            one = vary(composed, base, linear.starts, name, near)
+            one = vary(composed, base, name, near)
             if one is not None:
                 more[name] = one
         return linear.with_moved(more)
