@@ -124,7 +124,7 @@ class Search:
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
     _proposed: dict = field(default_factory=dict, repr=False)
-    _densities: dict[tuple[FittedSet, Whitener], np.ndarray] = field(default_factory=dict, repr=False)
+    _densities: dict[tuple[FittedSet, FittedSet], np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def along(self) -> Names:
@@ -253,9 +253,9 @@ class Search:
         Args:
             names: The set.
             begin: Where the fit begins.
-            scales: Whiteners of the first fit. Later fits are whitened by what the set leaves itself, as long
-                as the closed form promises more. A fit that stays behind the rival is begun anew with the
-                next scale.
+            scales: Whiteners of the first fit. Later fits are whitened by what the set leaves itself, and run
+                from where it puts the starts, as long as the closed form promises more, or is wrong along the
+                starts of a leading set. A fit that stays behind the rival is begun anew with the next scale.
             rival: Log evidence [nats] of the set to beat.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
@@ -264,10 +264,11 @@ class Search:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
                 before, (there, bend) = one.score, self._begun_anew(one)
-                if max(one.promise, before + bend) < max(before + BETTER, rival - NEAR):
+                leading = max((known.score for known in self.fitted.values()), default=before)
+                bent = bend > BETTER and before + bend > leading - NEAR_BY
+                if not bent and one.promise < max(before + BETTER, rival - NEAR):
                     break
-                again = self._judge(there, names, self._fit_point(there, one.point, one.whiten))
-                one = max((one, again), key=lambda fitted: fitted.score)
+                one = max((one, self._fit_again(there, one)), key=lambda fitted: fitted.score)
                 if one.score < before + BETTER:
                     break
             best = one if best is None or one.score > best.score else best
@@ -292,8 +293,13 @@ class Search:
         return there.moved(one.point), 0.5 * float(np.sum(one.whiten(np.nan_to_num(off)) ** 2))
 
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
-        linear = linearise(composed, begin, [], None if any(w.aside for w in composed.windows) else {})
-        return fit_effects(composed, linear, whiten, begin)
+        return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)
+
+    def _fit_again(self, composed: Composed, one: FittedSet) -> FittedSet:
+        """A set fitted further, whitened by what it leaves and by how errors of starts grow from there."""
+        linear = linearise(composed, one.point, [])
+        whiten = covariances(composed, linear).whitener(one.discrepancy, one.wide)
+        return self._judge(composed, one.names, fit_effects(composed, linear, whiten, one.point))
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).
@@ -480,17 +486,17 @@ class Search:
     def gains(self, one: FittedSet, other: FittedSet, by: FittedSet) -> np.ndarray:
         """Log densities (folds,) of each fold given the others, of one set over another.
 
-        Both are whitened with the discrepancy of `by`: its size differs between motions, so that a set which
-        leaves a smaller one in some of them predicts the others no worse for it.
+        Both have the discrepancy of `by`: its size differs between motions, so that a set which leaves a
+        smaller one in some of them predicts the others no worse for it. How errors of starts grow is each
+        set's own.
         """
-        mine, theirs = (self._held_out(s, by.whiten) for s in (one, other))
-        return mine - theirs
+        return self._held_out(one, by) - self._held_out(other, by)
 
-    def _held_out(self, one: FittedSet, whiten: Whitener) -> np.ndarray:
-        if (one, whiten) not in self._densities:
-            sets = self._sets(one.linear, [whiten], one.names)
-            self._densities[one, whiten] = sets.held_out(one.names, 0)
-        return self._densities[one, whiten]
+    def _held_out(self, one: FittedSet, by: FittedSet) -> np.ndarray:
+        if (one, by) not in self._densities:
+            whiten = one.covariances.whitener(by.discrepancy, by.wide)
+            self._densities[one, by] = self._sets(one.linear, [whiten], one.names).held_out(one.names, 0)
+        return self._densities[one, by]
 
     def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
         """Whether to go on from a set: it is likelier, and drops causes or predicts held-out logs better."""

@@ -86,8 +86,8 @@ def shrinkage(best: FittedSet, nothing: FittedSet, composed: Composed, fold: np.
             starts = {n: slope[inside] for n, slope in one.linear.starts.items()}
             residual[inside] = linearise(test, point, [], starts).residual
     usable = np.isfinite(after) & np.isfinite(before) & ~np.isin(rows.window, list(best.wide))
-    sensor = best.covariances.whitener()
-    white = [sensor(np.where(usable, r, 0.0)) ** 2 for r in (before, after)]
+    both = (nothing, before), (best, after)
+    white = [one.covariances.whitener()(np.where(usable, r, 0.0)) ** 2 for one, r in both]
     each = [usable & (fold == n) for n in np.unique(fold)]
     square = np.array([[*(w[m].sum() for w in white), best.noise * np.sum(m)] for m in each])
     gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]
