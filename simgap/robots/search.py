@@ -165,8 +165,9 @@ class Search:
         return self._with_less(leading) if self._is_better(leading, best) else best
 
     def _strays(self, one: FittedSet, best: FittedSet) -> bool:
-        """Whether a set's numerics are elsewhere than the best set's."""
-        size = [abs(v - best.point[n][k]) for n in self.along for k, v in one.point[n].items()]
+        """Whether a set's numerics are elsewhere than the best set's; what is linear has one optimum."""
+        bent = [n for n in self.along if not self.composed.effects[n].dear]
+        size = [abs(v - best.point[n][k]) for n in bent for k, v in one.point[n].items()]
         return max(size, default=0.0) > ASTRAY
 
     def forced(self, names: Names) -> FittedSet:
