@@ -220,7 +220,8 @@ def _values(
 def _numerics(body: Body) -> str:
     """The simulation's own time step and the hold of commands, in one sentence."""
     known = {
-        "option.timestep": "the solver's step by {:+.0%}",
+        "option.timestep": "the error of the solver's step by {:+.0%}",
+        "option.integrator": "{:.0%} of another integrator's error",
         "option.late": "commands come {:.2f} of a sample late",
         "option.hold": "commands are held {:.0%} of the way from a step to a line",
     }

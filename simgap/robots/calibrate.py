@@ -324,7 +324,7 @@ def _sensitivities(
     for effect in free:
         mine, step = np.array([e == effect for e, _ in names]), None
         for _ in range(2):  # by a usual step, then one as fine as the parameter is determined
-            one = vary(composed, base, linear.starts, effect, step=step, shifted=False)
+            one = vary(composed, base, effect, step=step, shifted=False)
             if one is None:
                 break
             columns[:, mine] = whiten(np.nan_to_num(one.jacobian)) * sd[mine]

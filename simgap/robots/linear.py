@@ -37,14 +37,16 @@ class Moved:
 class Linear:
     """The gap linearised about a point.
 
-    `point`: the point; `rows`: the rows that are compared; `residual`: recorded less simulated values (N,);
-    NaN where a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's
-    start; `moved`: how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number
-    of windows whose rollout diverged; `rates`: rates (N,) of the simulated channels.
+    `point`: the point; `rows`: the rows that are compared; `target`: recorded values (N,), along straight
+    lines as if every window were run from its start; `residual`: these less simulated values (N,); NaN where
+    a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's start; `moved`:
+    how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number of windows whose
+    rollout diverged; `rates`: rates (N,) of the simulated channels.
     """
 
     point: Point
     rows: Rows
+    target: np.ndarray
     residual: np.ndarray
     starts: Mapping[str, np.ndarray]
     moved: Mapping[str, Moved]
@@ -94,15 +96,27 @@ def linearise(
     base = base_at(composed, point)
     if all(channels is None for channels in base.read):
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
-    residual = composed.rows.observed - base.rows
     starts = _by_start(composed, base) if starts is None else starts
+    target = composed.rows.observed + _brought_back(composed, starts)
     dropped, every = sum(channels is None for channels in base.read), {}
     for number, name in enumerate(effects):
         say(f"{number + 1} of {len(effects)}, {name}")
-        every[name] = vary(composed, base, starts, name)
+        every[name] = vary(composed, base, name)
     moved = {n: one for n, one in every.items() if one is not None}
     diverged = tuple(n for n in every if n not in moved)
-    return Linear(point, composed.rows, residual, starts, moved, diverged, dropped, _rates(composed, base))
+    return Linear(
+        point, composed.rows, target, target - base.rows, starts, moved, diverged, dropped,
+        _rates(composed, base),
+    )  # fmt: skip
+
+
+def _brought_back(composed: Composed, starts: Mapping[str, np.ndarray]) -> np.ndarray:
+    """How rows (N,) move as windows are run aside of their starts, along straight lines."""
+    out = np.zeros(composed.rows.log.size)
+    for window, mine in zip(composed.windows, composed.rows.of, strict=True):
+        for state, by in window.aside.items():
+            out[mine] += by * starts[state][mine]
+    return out
 
 
 def _rates(composed: Composed, base: Base) -> np.ndarray:
@@ -118,7 +132,6 @@ def _rates(composed: Composed, base: Base) -> np.ndarray:
 def vary(
     composed: Composed,
     base: Base,
-    starts: Mapping[str, np.ndarray],
     name: str,
     at: Mapping[str, float] | None = None,
     step: np.ndarray | None = None,
@@ -129,7 +142,6 @@ def vary(
     Args:
         composed: The model along its windows.
         base: Rollouts without a change.
-        starts: Derivatives by the starts.
         name: The effect.
         at: Where it is linearised, reached from neutral, if the base's point does not have it act; the point
             itself by default.
@@ -146,7 +158,7 @@ def vary(
     here, rows, shift = now, base.rows, np.zeros(base.rows.size)
     if at is not None and name not in base.point:
         here = {**neutral, **at}
-        rows = _rows_at(composed, base, starts, name, here)
+        rows = _rows_at(composed, base, name, here)
         shift = rows - base.rows
     names, log, columns = [*effect.parameters], composed.rows.log, []
     sizes = np.full(len(names), STEP) if step is None else step
@@ -156,7 +168,7 @@ def vary(
     for kind in range(kinds):
         mine = names[kind::kinds]
         move = step_of(composed, name, mine[0], here[mine[0]], sizes[kind::kinds].min())
-        there = _rows_at(composed, base, starts, name, {**here, **{n: here[n] + move for n in mine}})
+        there = _rows_at(composed, base, name, {**here, **{n: here[n] + move for n in mine}})
         columns.append((there - rows) / move)
     if effect.by_log:
         columns = [np.where(log == i // kinds, columns[i % kinds], 0.0) for i in range(len(names))]
@@ -166,7 +178,7 @@ def vary(
         return None
     point = np.array([here[n] for n in effect.parameters])
     if name in base.point and shifted and not effect.fitted:
-        shift = base.rows - _rows_at(composed, base, starts, name, neutral)
+        shift = base.rows - _rows_at(composed, base, name, neutral)
         if not _bounded(shift[fine]):  # the straight line back, where neutral itself diverges
             shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
     return Moved(point, shift, jacobian)
@@ -187,29 +199,20 @@ def with_wobble(composed: Composed, linear: Linear) -> Composed:
     return replace(composed, wobble=np.where(strikes[:, None] & np.isfinite(columns), columns, 0.0))
 
 
-def _rows_at(
-    composed: Composed, base: Base, starts: Mapping[str, np.ndarray], name: str, values: Mapping[str, float]
-) -> np.ndarray:
-    """Rows (N,) with one effect at other values. A read-out effect needs no rollout: starts, which are read
-    through it, move the rows by their sensitivities."""
+def _rows_at(composed: Composed, base: Base, name: str, values: Mapping[str, float]) -> np.ndarray:
+    """Rows (N,) with one effect at other values. Starts are read through read-out effects, so that a large
+    one moves them farther than along straight lines."""
     effect = composed.effects[name]
     moved = {**base.point, name: dict(values)}
-    if effect.alter is None:
-        if composed.effects[name].numeric:
-            run, now = list(base.true), {**effect.neutral(), **base.point.get(name, {})}
-            for short, value in values.items():
-                run = composed.stepped(run, name, short, value - now[short])
-        else:
-            run = composed.rolled(moved, base.begun)
-        return composed.rows.averaged(composed.read(run, moved))
-    out = composed.rows.averaged(composed.read(base.true, moved))
-    if effect.restore is not None:
-        for old, new, mine in zip(base.begun, composed.starts(moved), composed.rows.of, strict=True):
-            if old is not None and new is not None:
-                for state, change in starts.items():
-                    if state in old and new[state] != old[state]:
-                        out[mine] = out[mine] + change[mine] * (new[state] - old[state])
-    return out
+    if effect.numeric:
+        run, now = list(base.true), {**effect.neutral(), **base.point.get(name, {})}
+        for short, value in values.items():
+            run = composed.stepped(run, name, short, value - now[short])
+    elif effect.alter is not None and effect.restore is None:
+        run = base.true
+    else:
+        run = composed.rolled(moved, base.begun if effect.restore is None else composed.starts(moved))
+    return composed.rows.averaged(composed.read(run, moved))
 
 
 def step_of(composed: Composed, effect: str, name: str, value: float, size: float = STEP) -> float:

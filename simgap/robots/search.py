@@ -37,7 +37,7 @@ from simgap.robots.sets import (
     without,
 )
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
-from simgap.robots.windows import STRIKES
+from simgap.robots.windows import JUMPS, STRIKES
 from simgap.simulators.protocol import Parameter
 
 EXPECTED = 1.0  # prior: how many of all candidates act
@@ -123,9 +123,8 @@ class Search:
     columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
-    _starts: dict[str, np.ndarray] = field(default_factory=dict, repr=False)  # of the empty set: steers fits
     _proposed: dict = field(default_factory=dict, repr=False)
-    _densities: dict[tuple[FittedSet, Whitener], np.ndarray] = field(default_factory=dict, repr=False)
+    _densities: dict[tuple[FittedSet, FittedSet], np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def along(self) -> Names:
@@ -166,8 +165,9 @@ class Search:
         return self._with_less(leading) if self._is_better(leading, best) else best
 
     def _strays(self, one: FittedSet, best: FittedSet) -> bool:
-        """Whether a set's numerics are elsewhere than the best set's."""
-        size = [abs(v - best.point[n][k]) for n in self.along for k, v in one.point[n].items()]
+        """Whether a set's numerics are elsewhere than the best set's; what is linear has one optimum."""
+        bent = [n for n in self.along if not self.composed.effects[n].dear]
+        size = [abs(v - best.point[n][k]) for n in bent for k, v in one.point[n].items()]
         return max(size, default=0.0) > ASTRAY
 
     def forced(self, names: Names) -> FittedSet:
@@ -191,7 +191,6 @@ class Search:
             every = linearise(self.composed, point, [*self.along, *self.wanted])
             self.composed = with_wobble(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
-        self._starts = dict(linear.starts)
         return self.fit((), point, [covariances(self.composed, linear).whitener()])
 
     def _from(self, best: FittedSet, tell: Progress) -> FittedSet:
@@ -255,9 +254,9 @@ class Search:
         Args:
             names: The set.
             begin: Where the fit begins.
-            scales: Whiteners of the first fit. Later fits are whitened by what the set leaves itself, as long
-                as the closed form promises more. A fit that stays behind the rival is begun anew with the
-                next scale.
+            scales: Whiteners of the first fit. Later fits are whitened by what the set leaves itself, and run
+                from where it puts the starts, as long as the closed form promises more, or is wrong along the
+                starts of a leading set. A fit that stays behind the rival is begun anew with the next scale.
             rival: Log evidence [nats] of the set to beat.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
@@ -265,12 +264,12 @@ class Search:
         for whiten in scales:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
-                before = one.score
-                if one.promise < max(before + BETTER, rival - NEAR):
+                before, (there, bend) = one.score, self._begun_anew(one)
+                leading = max((known.score for known in self.fitted.values()), default=before)
+                bent = bend > BETTER and before + bend > leading - NEAR_BY
+                if not bent and one.promise < max(before + BETTER, rival - NEAR):
                     break
-                there = self.composed.moved(one.point)
-                again = self._judge(there, names, self._fit_point(there, one.point, one.whiten))
-                one = max((one, again), key=lambda fitted: fitted.score)
+                one = max((one, self._fit_again(there, one)), key=lambda fitted: fitted.score)
                 if one.score < before + BETTER:
                     break
             best = one if best is None or one.score > best.score else best
@@ -281,9 +280,27 @@ class Search:
             self.fitted[key] = best
         return self.fitted[key]
 
+    def _begun_anew(self, one: FittedSet) -> tuple[Composed, float]:
+        """The model about a set's fit, with windows run from where that puts their starts; and by how much
+        straight lines from where they were run from are wrong there [nats]."""
+        composed, linear, asides = one.composed, one.linear, {}
+        for k, sizes in one.covariances.starts(one.whiten, np.nan_to_num(linear.residual)).items():
+            away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
+            asides[k] = {n: float(doubt * size) for (n, doubt), size in away if n != JUMPS}
+        if not any(asides.values()):
+            return composed.moved(one.point), 0.0
+        there = composed.run_aside(asides)
+        off = linearise(there, one.point, [], linear.starts).residual - linear.residual
+        return there.moved(one.point), 0.5 * float(np.sum(one.whiten(np.nan_to_num(off)) ** 2))
+
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
-        linear = linearise(composed, begin, [], self._starts)
-        return fit_effects(composed, linear, whiten, begin)
+        return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)
+
+    def _fit_again(self, composed: Composed, one: FittedSet) -> FittedSet:
+        """A set fitted further, whitened by what it leaves and by how errors of starts grow from there."""
+        linear = linearise(composed, one.point, [])
+        whiten = covariances(composed, linear).whitener(one.discrepancy, one.wide)
+        return self._judge(composed, one.names, fit_effects(composed, linear, whiten, one.point))
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).
@@ -340,7 +357,7 @@ class Search:
                 if name not in self.columns:
                     say(f"what {name} would do")
                     size = np.full(len(composed.effects[name].parameters), USUAL)
-                    self.columns[name] = vary(composed, base, linear.starts, name, step=size)
+                    self.columns[name] = vary(composed, base, name, step=size)
                 one = self.columns[name]
                 more |= {} if one is None else {name: one}
         linear = linear.with_moved(more)
@@ -421,7 +438,7 @@ class Search:
                 near = {
                     n: p.nominal + (p.sd if p.nominal + p.sd <= p.high else -p.sd) for n, p in known.items()
                 }
-            one = vary(composed, base, linear.starts, name, near)
+            one = vary(composed, base, name, near)
             if one is not None:
                 more[name] = one
         return linear.with_moved(more)
@@ -470,17 +487,17 @@ class Search:
     def gains(self, one: FittedSet, other: FittedSet, by: FittedSet) -> np.ndarray:
         """Log densities (folds,) of each fold given the others, of one set over another.
 
-        Both are whitened with the discrepancy of `by`: its size differs between motions, so that a set which
-        leaves a smaller one in some of them predicts the others no worse for it.
+        Both have the discrepancy of `by`: its size differs between motions, so that a set which leaves a
+        smaller one in some of them predicts the others no worse for it. How errors of starts grow is each
+        set's own.
         """
-        mine, theirs = (self._held_out(s, by.whiten) for s in (one, other))
-        return mine - theirs
+        return self._held_out(one, by) - self._held_out(other, by)
 
-    def _held_out(self, one: FittedSet, whiten: Whitener) -> np.ndarray:
-        if (one, whiten) not in self._densities:
-            sets = self._sets(one.linear, [whiten], one.names)
-            self._densities[one, whiten] = sets.held_out(one.names, 0)
-        return self._densities[one, whiten]
+    def _held_out(self, one: FittedSet, by: FittedSet) -> np.ndarray:
+        if (one, by) not in self._densities:
+            whiten = one.covariances.whitener(by.discrepancy, by.wide)
+            self._densities[one, by] = self._sets(one.linear, [whiten], one.names).held_out(one.names, 0)
+        return self._densities[one, by]
 
     def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
         """Whether to go on from a set: it is likelier, and drops causes or predicts held-out logs better."""

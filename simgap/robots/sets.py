@@ -195,21 +195,24 @@ class Sets:
         count, a = free.shape[1], self.along
         size = np.bincount(block, minlength=len(ordered[0]))
         prior, x = np.ones(free.shape), np.zeros(free.shape)
-        eye, held = np.eye(count), np.zeros(free.shape, bool)
+        eye, side = np.eye(count), np.zeros(free.shape, int)  # side: -1 fixed low, 1 fixed high
         for _ in range(TURNS):
-            at = np.where(
-                held, np.where(x < 0.5 * (np.maximum(low, -1e9) + np.minimum(high, 1e9)), low, high), 0.0
-            )
+            held = side != 0
+            at = np.where(side < 0, low, np.where(side > 0, high, 0.0))
             rest = np.where(held, at, pull - np.einsum("bij,bj->bi", bend, at))
             loose = ~(held[:, :, None] | held[:, None, :])
             matrix = np.where(loose, bend + prior[:, :, None] * eye, eye)
             x = np.linalg.solve(matrix, rest[..., None])[..., 0]
-            outside = (x < low) | (x > high)
-            held |= outside
+            # As in `simgap.bounded`: what lies beyond a bound is fixed there, what is drawn inwards freed.
+            slope = np.einsum("bij,bj->bi", bend, x) + prior * x - pull
+            beyond = (x > high).astype(int) - (x < low)
+            side = np.where(held, np.where(side * slope > 0, 0, side), beyond)
             x = np.clip(x, low, high)
             if block.size:
                 square_x = np.stack([np.sum(x[:, a:][:, block == j] ** 2, 1) for j in range(size.size)], 1)
                 prior[:, a:] = ((1 + size) / (1 + square_x))[:, block]
+        held = side != 0
+        loose = ~(held[:, :, None] | held[:, None, :])
         matrix = np.where(loose, bend + prior[:, :, None] * eye, eye)
         energy = square - 2 * np.einsum("bi,bi->b", pull, x) + np.einsum("bi,bij,bj->b", x, bend, x)
         score = -0.5 * np.maximum(energy, 0.0) - half - 0.5 * np.sum(x[:, :a] ** 2, 1)

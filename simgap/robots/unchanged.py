@@ -176,7 +176,7 @@ class Runs:
             mine = np.array([e == effect for e, _ in of.names])
             sd = np.array([p.sd for p in self.composed.effects[effect].parameters.values()])
             step = STEP * np.maximum(sizes[mine], 1e-6 * sd) / sd
-            one = vary(self.composed, base, self.linear.starts, effect, step=step, shifted=False)
+            one = vary(self.composed, base, effect, step=step, shifted=False)
             if one is not None:
                 out[:, mine] = np.nan_to_num(one.jacobian) * sizes[mine]
         return self.standard(out)

@@ -31,7 +31,7 @@ from simgap.attribution.verdict import (
 )  # fmt: skip
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.fit import fit_effects
-from simgap.robots.linear import base_at, linearise
+from simgap.robots.linear import linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Phases
 from simgap.robots.search import FittedSet, Search, predicts_better
@@ -83,10 +83,11 @@ def shrinkage(best: FittedSet, nothing: FittedSet, composed: Composed, fold: np.
             point = _fitted(train, one, one.point)
             own = [n for n in point if composed.effects[n].by_log]
             point = _fitted(test, one, point, own) if own else point
-            residual[inside] = rows.observed[inside] - base_at(test, point).rows
+            starts = {n: slope[inside] for n, slope in one.linear.starts.items()}
+            residual[inside] = linearise(test, point, [], starts).residual
     usable = np.isfinite(after) & np.isfinite(before) & ~np.isin(rows.window, list(best.wide))
-    sensor = best.covariances.whitener()
-    white = [sensor(np.where(usable, r, 0.0)) ** 2 for r in (before, after)]
+    both = (nothing, before), (best, after)
+    white = [one.covariances.whitener()(np.where(usable, r, 0.0)) ** 2 for one, r in both]
     each = [usable & (fold == n) for n in np.unique(fold)]
     square = np.array([[*(w[m].sum() for w in white), best.noise * np.sum(m)] for m in each])
     gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]

@@ -194,6 +194,14 @@ class Covariances:
             ),
         )
 
+    def starts(self, whiten: Whitener, residual: np.ndarray) -> dict[int, np.ndarray]:
+        """Where a residual (N,) puts the start of every window, in standard deviations (S,) from it."""
+        white = whiten(residual)
+        return {
+            b.window: (inverse @ b.start).T @ white[b.rows]
+            for b, inverse in zip(self.blocks, whiten.inverses, strict=True)
+        }
+
     def outliers(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
         """Windows whose residual (N,) exceeds noise and discrepancy, with the factor of their variance.
 

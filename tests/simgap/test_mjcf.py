@@ -200,10 +200,31 @@ def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files
     found, log, _ = loaded(files)
     made = candidates(Setting(found.simulator, [log]))
     assert {n for n, e in made.items() if e.fitted} == found.simulator.numerics
-    steps = {"option.timestep", "option.hold", "option.late", "option.iterations"}
+    steps = {"option.timestep", "option.integrator", "option.hold", "option.late", "option.iterations"}
     assert found.simulator.numerics == steps
     with pytest.raises(InputError, match="option has no integratr"):
         loaded(files, "option.integratr")
+
+
+@pytest.mark.parametrize(
+    ("own", "name", "other"),
+    [("RK4", "timestep", "Euler"), ("RK4", "integrator", "implicit"), ("Euler", "integrator", "implicit"),
+     ("implicit", "integrator", "Euler")],
+)  # fmt: skip
+def test_another_integrator_errs_as_the_numerics_say(files, own, name, other):
+    """Whole it is that integrator's run; a third of Euler's error is what it errs at a third of the step."""
+
+    def run(integrator: str, step: float = 0.003, **options: float) -> np.ndarray:
+        xml = XML.replace("RK4", integrator).replace('"0.001"', f'"{step}"')
+        found, log, _ = loaded(lambda: files(xml))
+        values = {n: s.nominal for n, s in found.simulator.settings.items()} | options
+        return found.simulator.simulate(values, log.window(0, 60), {"q": 0.5, "q_rate": 0.0})["q"]
+
+    np.testing.assert_allclose(run(own, **{f"option.{name}": 1.0}), run(other), atol=1e-12)
+    if name == "timestep":
+        error = run(other, 0.001) - run(own)
+        left = run(own, **{f"option.{name}": 1 / 3}) - run(own) - error
+        assert np.abs(error).max() > 1e-4 and np.abs(left).max() < 0.05 * np.abs(error).max()
 
 
 SERVO = """<mujoco>

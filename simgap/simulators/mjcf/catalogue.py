@@ -203,6 +203,8 @@ class _Catalogue:
                 self.add(f"option.{axis}", 0.01, "the base is tilted", effect="gravity.direction")
         says = "the simulator's own time step, relative"
         self.add("option.timestep", 0.5, says, low=-1.1, high=1.0)
+        says = "the simulator's integrator: implicit, or Euler's if it is"
+        self.add("option.integrator", 0.5, says, low=0.0, high=1.0)
         if self.simulator.driven:
             # What comes half a sample later than in steps is a delay like any other, and reported as one.
             says = "commands between samples: in steps (0), in lines (1, half a sample sooner)"

@@ -39,10 +39,10 @@ class _Friction:
 @dataclass(frozen=True)
 class Laws:
     """Laws that act in a model: `friction` of joints, and of `fading` drives the actuator, the fade over its
-    largest force, and the joint torques (nv,) of a unit force."""
+    largest force, the joint's number, and its torque by a unit force."""
 
     friction: tuple[_Friction, ...]
-    fading: tuple[tuple[int, float, np.ndarray], ...]
+    fading: tuple[tuple[int, float, int, float], ...]
 
     def __bool__(self) -> bool:
         return bool(self.friction or self.fading)
@@ -59,9 +59,9 @@ class Laws:
                 joints.setdefault(thing, {})[attribute] = value
             elif kind == "actuator" and attribute == FADE:
                 a = object_id(model, "actuator", thing)
-                arm = np.zeros(model.nv)
-                arm[int(model.jnt_dofadr[int(model.actuator_trnid[a, 0])])] = float(model.actuator_gear[a, 0])
-                fading.append((a, value / max(most_of(model, a), 1e-9), arm))
+                dof = int(model.jnt_dofadr[int(model.actuator_trnid[a, 0])])
+                by = value / max(most_of(model, a), 1e-9)
+                fading.append((a, by, dof, float(model.actuator_gear[a, 0])))
         friction = tuple(
             _friction(model, n, own) for n, own in joints.items() if {*own} != {"stribeck_speed"}
         )
@@ -90,23 +90,23 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
     out = np.empty((*control.shape[:2], model.nsensordata))
     plain = np.array(model.dof_frictionloss)
     usual = plain.tolist()
-    step, pushed, every = mujoco.mj_step, data.qfrc_applied, model.dof_frictionloss
+    step, every, ctrl, sensed = mujoco.mj_step, model.dof_frictionloss, data.ctrl, data.sensordata
     # A memoryview reads and writes plain numbers, several times as fast as an array.
-    seen = every, data.qvel, data.qfrc_actuator, data.qfrc_bias, data.actuator_force
+    seen = every, data.qvel, data.qfrc_actuator, data.qfrc_bias, data.actuator_force, data.qfrc_applied
     views: list[Any] = [memoryview(each) for each in seen]
-    limit, rate, motor, bias, force = views
-    extra = bool(laws.fading) or any(f.drag for f in laws.friction)
+    limit, rate, motor, bias, force, pushed = views
+    applied = {*(f.dof for f in laws.friction if f.drag), *(dof for _, _, dof, _ in laws.fading)}
     try:
         for b in range(len(first)):
             every[:] = plain
             mujoco.mj_resetData(model, data)
             mujoco.mj_setState(model, data, first[b], FULL)
-            data.ctrl[:] = control[b, 0]
+            ctrl[:] = control[b, 0]
             mujoco.mj_forward(model, data)
             data.qacc_warmstart[:] = 0.0
             for k in range(control.shape[1]):
-                if extra:
-                    pushed[:] = 0.0
+                for dof in applied:
+                    pushed[dof] = 0.0
                 for f in laws.friction:
                     d, w = f.dof, rate[f.dof]
                     most = usual[d]
@@ -119,11 +119,11 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
                     limit[d] = most if most > 0 else 0.0
                     if f.drag:
                         pushed[d] -= f.drag * w * abs(w)
-                for a, by, arm in laws.fading:
-                    pushed -= by * abs(force[a]) * force[a] * arm
-                data.ctrl[:] = control[b, k]
+                for a, by, dof, gear in laws.fading:
+                    pushed[dof] -= by * abs(force[a]) * force[a] * gear
+                ctrl[:] = control[b, k]
                 step(model, data)
-                out[b, k] = data.sensordata
+                out[b, k] = sensed
     finally:
         every[:] = plain
     return out

@@ -214,9 +214,12 @@ def _actuator(model: Any, name: str, attribute: str) -> Setting | None:
 
 
 def _option(model: Any, _: str, attribute: str) -> Setting | None:
-    """tilt_x, tilt_y (gravity rotated about the world's axes [rad]), timestep (relative), iterations (0: as
-    in the model, 1: ten times), and how commands are held."""
+    """tilt_x, tilt_y (gravity rotated about the world's axes [rad]), timestep (relative; of Runge-Kutta's,
+    which hardly errs, the share of Euler's error), integrator (0: as in the model, 1: implicit, or Euler if
+    it is), iterations (0: as in the model, 1: ten times), and how commands are held."""
     down, step, count = np.array(model.opt.gravity), float(model.opt.timestep), int(model.opt.iterations)
+    kinds, own = mujoco.mjtIntegrator, int(model.opt.integrator)
+    exact, explicit = own == kinds.mjINT_RK4, own in (kinds.mjINT_RK4, kinds.mjINT_EULER)
     whole, axis = f"option.{attribute}", np.eye(3)[int(attribute == "tilt_y")]
 
     def tilt(m: Any, value: float) -> None:
@@ -225,13 +228,20 @@ def _option(model: Any, _: str, attribute: str) -> Setting | None:
     def scale(m: Any, value: float) -> None:
         m.opt.timestep = step * (1 + value)
 
+    def err(m: Any, value: float) -> None:
+        m.opt.integrator = kinds.mjINT_EULER
+
+    def other(m: Any, value: float) -> None:
+        m.opt.integrator = kinds.mjINT_IMPLICIT if explicit else kinds.mjINT_EULER
+
     def more(m: Any, value: float) -> None:
         m.opt.iterations = 10 * count
 
     made = {
         "tilt_x": Setting(whole, "rad", 0.0, tilt),
         "tilt_y": Setting(whole, "rad", 0.0, tilt),
-        "timestep": Setting(whole, "1", 0.0, scale, mixed=-0.75),
+        "timestep": Setting(whole, "1", 0.0, err if exact else scale, mixed=1.0 if exact else -0.75),
+        "integrator": Setting(whole, "1", 0.0, other, stored=False, mixed=1.0),
         "iterations": Setting(whole, "1", 0.0, more, stored=False, mixed=1.0),
         "hold": Setting(whole, "1", 0.0, nothing, stored=False),
         "late": Setting(whole, "1", 0.0, nothing, stored=False),
@@ -260,7 +270,7 @@ KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...
     "geom": (_geom, ("friction", "torsional", "time_constant", "damping_ratio", "dmin", "size")),
     "actuator": (_actuator, ("gain", "damping", "limit", FADE)),
     "drive": (_drive, ("gravity_compensation",)),
-    "option": (_option, ("tilt_x", "tilt_y", "timestep", "iterations", "hold", "late")),
+    "option": (_option, ("tilt_x", "tilt_y", "timestep", "integrator", "iterations", "hold", "late")),
 }
 
 
@@ -312,7 +322,7 @@ def changed_model(
         yield
         return
     kept, opt = {name: np.array(getattr(model, name)) for name in FIELDS}, model.opt
-    options = np.array(opt.gravity), opt.timestep, opt.iterations
+    options = np.array(opt.gravity), opt.timestep, opt.integrator, opt.iterations
     derived = any(settings[name].derived for name, _ in values)
     try:
         for name, value in values:
@@ -323,6 +333,6 @@ def changed_model(
     finally:
         for name, own in kept.items():
             getattr(model, name)[:] = own
-        opt.gravity[:], opt.timestep, opt.iterations = options
+        opt.gravity[:], opt.timestep, opt.integrator, opt.iterations = options
         if derived:
             mujoco.mj_setConst(model, mujoco.MjData(model))
