@@ -24,6 +24,8 @@ Source = Any  # a path, a DataFrame, a dict of arrays, or what the readers give
 def read_trials(trials: Source | Sequence[Source], rig: Source = None, task: Source = None) -> list[Trial]:
     """Trials from one source or several; InputError for anything at fault."""
     several = isinstance(trials, Sequence) and not isinstance(trials, str)
+    if several and not trials:
+        raise InputError("trials", "none given", "at least one trial")
     return [Trial.read(each, rig, task) for each in (trials if several else [trials])]
 
 

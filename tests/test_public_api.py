@@ -110,6 +110,12 @@ def test_mistakes_say_what_to_write():
         align(STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
     with pytest.raises(InputError, match="needs no fit"):
         hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
+    for none in (
+        lambda: segment([], STACK / "task.toml", STACK / "rig.toml"),
+        lambda: segment([], {"sequence": ["a", "b"]}),
+    ):
+        with pytest.raises(InputError, match="trials: none given; expected at least one trial"):
+            none()
 
 
 CELLS = (
