@@ -70,16 +70,20 @@ def write_open(
     """
     nominal = load_rig(NOMINAL / "rig.toml")
     cases = draw_cases(count, seed, nominal, shares=shares, fastest=fastest)
+    labels = []
     for k, case in enumerate(cases):
         folder = out / case.name
         if not (folder / "truth").exists():
-            trials = record_case(case, nominal)
+            try:
+                trials = record_case(case, nominal)
+            except RuntimeError:  # no hand performs it
+                continue
             write_folder(folder, case, trials, nominal)
             _write_truth(folder, trials)
+        labels.append(_open_label(case))
         if progress is not None:
             progress(k + 1, count)
-    labels = json.dumps([_open_label(case) for case in cases], indent=1)
-    (out / "labels.json").write_text(labels + "\n", encoding="utf-8")
+    (out / "labels.json").write_text(json.dumps(labels, indent=1) + "\n", encoding="utf-8")
 
 
 def _write_truth(folder: Path, trials: list[Recorded]) -> None:
