@@ -204,9 +204,10 @@ def changed(body: Body) -> list[str]:
     if body["verdict"] == "none":
         return ["No change that these logs can show: the model fits the new ones as well as the old ones."]
     if body["verdict"] == "unknown":
-        over = body["remainder"]["rms_over_noise"]
+        over, p = body["remainder"]["rms_over_noise"], p_text(body["remainder"]["p_value"])
         best = [f"The best known explanation, {text}, leaves too much." for text in body["changes"]]
-        return [f"The model's error on the new logs is {over:.2g} times that on the old ones.", *best]
+        size = f"The model's error on the new logs is {over:.3g} times that on the old ones"
+        return [f"{size} ({p} if nothing changed).", *best]
     p = p_text(body["detection"]["p_value"])
     out = [f"Changed: {'; '.join(body['changes'])} ({p} if nothing changed)."]
     if body["verdict"] == "set":

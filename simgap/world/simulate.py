@@ -244,12 +244,16 @@ DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals 
 
 
 def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
-    """Contents of rig.toml, task.toml and actual.toml by file name."""
+    """Contents of rig.toml, task.toml and actual.toml by file name.
+
+    Trials have the fingertips' own columns, in SI units, whatever those of the rig's recordings are.
+    """
     actual = {
         name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
         for name in task.objects
     }
-    return {"rig.toml": tomlkit.dumps(rig.model_dump(exclude_none=True, exclude_defaults=True)),
+    hand = rig.model_dump(exclude={"columns", "topics", "gripper"}, exclude_none=True, exclude_defaults=True)
+    return {"rig.toml": tomlkit.dumps(hand),
             "task.toml": tomlkit.dumps(task_table(task)), "actual.toml": tomlkit.dumps(actual)}  # fmt: skip
 
 

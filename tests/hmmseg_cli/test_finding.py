@@ -7,6 +7,7 @@ from hmmseg_cli.pages import Setting, page
 from simgap.effects import catalogue
 from simgap.report.finding import (
     chances,
+    changed,
     checks,
     headline,
     moving,
@@ -187,6 +188,12 @@ def test_an_unknown_gap_of_a_robot_names_the_best_and_why_it_is_none():
     shown = page(ROBOT, Setting(["a.csv"]), lambda path: None)
     assert "None explains a hundredth of the gap" in shown and "68 %" not in shown
     assert "Logs of a robot that is as its model differ" in shown
+
+
+def test_a_change_that_nothing_explains_is_told_with_its_size_and_chance():
+    left = {"share": None, "p_value": 0.0074, "where": [], "rms_over_noise": 1.0119}
+    (said,) = changed(body("unknown", [], changes=[], remainder=left))
+    assert said.endswith("new logs is 1.01 times that on the old ones (p = 0.0074 if nothing changed).")
 
 
 def test_causes_that_act_together_are_listed_once_in_units_that_read_well():

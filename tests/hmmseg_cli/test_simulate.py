@@ -50,6 +50,21 @@ def test_trials_are_written_as_a_folder_of_recordings(tmp_path, inputs):
     assert (again / "trial_02.csv").read_bytes() == (out / "trial_02.csv").read_bytes()
 
 
+@pytest.mark.parametrize(
+    "more",
+    [
+        '[columns]\nt = {from = "stamp", unit = "ms"}\nx1 = {from = "left [mm]", unit = "mm"}\n',
+        '[gripper]\nposition = ["x", "y", "z"]\nopening = "w"\nwrench = ["fx", "fy", "fz"]\n',
+    ],
+)
+def test_the_rig_that_is_written_reads_the_trials_that_are(tmp_path, inputs, more):
+    (tmp_path / "rig.toml").write_text("rate = 50.0\n" + more)
+    out = tmp_path / "out"
+    assert main(["simulate", *inputs, "--output", str(out)]) == 0
+    trial = ["--task", str(out / "task.toml"), "--rig", str(out / "rig.toml"), "--quiet"]
+    assert main(["segment", str(out / "trial_01.csv"), *trial]) == 0
+
+
 def test_a_replay_predicts_the_recording_s_forces(tmp_path, inputs):
     made, out = tmp_path / "made", tmp_path / "replayed"
     assert main(["simulate", *inputs, "--output", str(made)]) == 0
