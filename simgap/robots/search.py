@@ -502,8 +502,8 @@ class Search:
     def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
         """Whether to go on from a set: it is likelier, and drops causes or predicts held-out logs better.
 
-        The judge is what the likelier set leaves: beside a discrepancy of twenty times the noise, a cause that
-        explains it all hardly shows.
+        The judge is what the likelier set leaves: next to a discrepancy of twenty times the noise, a cause
+        that explains it all hardly shows.
         """
         if one.score <= best.score + BETTER:
             return False

@@ -19,6 +19,7 @@ from simgap.attribution.problem import Rows as GapRows
 from simgap.attribution.search import Detection
 from simgap.attribution.verdict import (
     LEAST,
+    MOST,
     RULED_OUT,
     Cell,
     Explanation,
@@ -42,8 +43,7 @@ RECORD = (
     0.92  # learned: 24 of 26 named were right (`experiments.robots_check` and `.given`), all nearly certain
 )
 MATTERS = 1.1  # chosen: mean square over the noise's; a smaller unexplained gap is reported as none
-SEVERAL = 3.0  # chosen: rms over the noise's; causes that leave more, and over PART of the gap, are not known
-PART = 0.1  # chosen: that share of the gap
+PART = 0.1  # chosen: share of the gap by which what an alternative leaves may exceed what the best set leaves
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def verdict_on(
     causes = best.names if forced else tuple(n for n, big in zip(best.names, large, strict=True) if big)
     left = shares.remainder if far is None else max(1.0 - far.fraction, 0.0)
     doubts = _absurd(search.composed.effects, best, causes)
-    if over_noise > SEVERAL and left > PART:
+    if left > MOST:
         doubts = (*doubts, f"{over_noise:.3g} times the noise is left")
     right = 0.0 if doubts else known(left, 1.0 - left)
     others = _alternatives(search, best)
