@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -171,7 +172,8 @@ def _against(
     if isinstance(task, BlockTask):
         refuse("goes only with a plain ordered task", {"--model": model_file})
         hand = read_rig(require_rig(rig_file, paths))
-    read = read_trials(out, every, hand, None if isinstance(task, BlockTask) else task)
+    ordered = None if isinstance(task, BlockTask) else task
+    read = [*read_trials(out, every[:count], hand, ordered), *_simulated(out, every[count:], hand, ordered)]
     with out.progress("diagnosing", total=3) as advance:
         if isinstance(task, BlockTask):
             assert hand is not None
@@ -185,6 +187,17 @@ def _against(
     out.print(sentence(found.body), *tables(found.body))
     _draw(out, found, [trial.name for trial in read[:count]], task, effects())
     out.finish(found.body)
+
+
+def _simulated(out: Output, paths: Sequence[Path], hand: Rig | None, task: SequenceTask | None) -> list[Any]:
+    """Given simulated trials, with the recordings' columns or with ours, as `hmmseg simulate` writes them."""
+    try:
+        return read_trials(out, paths, hand, task)
+    except InputError:
+        if hand is not None and hand.columns:
+            with suppress(InputError):
+                return read_trials(out, paths, hand.model_copy(update={"columns": {}}), task)
+        raise
 
 
 def _draw(

@@ -8,6 +8,8 @@ import pandas as pd
 import pytest
 
 from experiments.generic_ensembles import ensemble
+from hmmseg.errors import InputError
+from hmmseg.example import example_folder
 from hmmseg_cli.main import main
 
 
@@ -65,6 +67,24 @@ def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypat
     (folder / "actual.toml").write_text("")
     assert main(arguments(folder, *more)) == 2
     assert line in capsys.readouterr().err
+
+
+def test_trials_as_simulate_writes_them_go_with_recordings_of_other_columns(tmp_path, monkeypatch):
+    example, read = example_folder(), []
+    clock = '\n[columns]\nt = {from = "stamp", unit = "ms"}\n'
+    (tmp_path / "rig.toml").write_text((example / "rig.toml").read_text() + clock)
+    table = pd.read_csv(example / "trial_01.csv").rename(columns={"t": "stamp"})
+    table.assign(stamp=1000 * table.stamp).to_csv(tmp_path / "real.csv", index=False)
+
+    def stop(real, simulated, *_):
+        read.extend([*real, *simulated])
+        raise InputError("test", "has seen enough")
+
+    monkeypatch.setattr("simgap.generic.trials.align_block_trials", stop)
+    args = ["--task", str(example / "task.toml"), "--rig", str(tmp_path / "rig.toml"), "--against"]
+    assert main(["diagnose", str(tmp_path / "real.csv"), *args, str(example / "trial_01.csv")]) == 2
+    real, simulated = read
+    np.testing.assert_allclose(real.t, simulated.t, atol=1e-9)
 
 
 @pytest.mark.slow
