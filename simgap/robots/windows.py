@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
+from hmmseg.levels import GAP
 from simgap.simulators.protocol import RATE, Simulator
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
@@ -63,8 +64,8 @@ class Window:
 def cut(
     simulator: Simulator, recordings: Sequence[Recording], noise: Mapping[str, float], length: float = LENGTH
 ) -> list[Window]:
-    """Cut every log into windows; new ones begin at changes of contact and where touching bodies come to
-    rest.
+    """Cut every log into windows; new ones begin after gaps, at changes of contact and where touching bodies
+    come to rest.
 
     Args:
         simulator: The robot's model; one that does not restart gets one window a log.
@@ -83,7 +84,11 @@ def cut(
         rests = touching & resting(log, reach)
         turns = np.flatnonzero(np.diff(rests.astype(int))) + 1
         contacts = getattr(simulator, "contacts", None)
-        marks = [*([] if contacts is None else map(float, contacts(log))), *log.t[turns].tolist()]
+        step = np.diff(log.t)
+        gaps = (
+            np.flatnonzero(step > GAP * np.median(step)) + 1
+        )  # of what was commanded there nothing is known
+        marks = [*([] if contacts is None else map(float, contacts(log))), *log.t[turns], *log.t[gaps]]
         edges = _edges(log, marks, length)
         edges[0] = _readable(simulator, log, edges[1])
         for begin, end in itertools.pairwise(edges):

@@ -44,6 +44,17 @@ def test_windows_tile_every_log_from_where_a_start_can_be_read():
         assert all(a.end == b.begin for a, b in itertools.pairwise(mine))
 
 
+def test_no_window_runs_across_a_gap_in_its_log():
+    whole = log(0)
+    kept = np.r_[0:150, 180:300, 304 : len(whole)]
+    columns = {n: v[kept] for n, v in whole.columns.items()}
+    model = composed([Recording(whole.name, whole.t[kept], columns)])
+    steps = [np.diff(model.recordings[0].t[w.begin : w.end]).max() for w in model.windows]
+    assert max(steps) < 0.011
+    residual, _, _ = whitened(model)
+    assert np.mean(residual**2) < 1.3
+
+
 def test_a_start_is_right_within_what_it_says():
     t = np.linspace(0, 1, 201)
     off = []
