@@ -316,7 +316,8 @@ def jackknife(strata: Sequence[np.ndarray], known: np.ndarray | float = 0.0) -> 
     each = np.maximum(np.array(parts), 1e-300)
     total = each.sum(0) + known
     share = np.divide(each, total, out=np.ones_like(each), where=np.isfinite(total))
-    return np.sqrt(total), 1 / np.sum(share**2 / np.array(freedom)[:, None], 0)
+    freed = np.sum(share**2 / np.array(freedom)[:, None], 0)
+    return np.sqrt(total), 1 / np.maximum(freed, 1e-300)  # what is known has no end of them
 
 
 @dataclass(frozen=True)
