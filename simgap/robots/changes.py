@@ -563,14 +563,14 @@ def _chances(best: Change, weight: Mapping[str, float], p_value: float, worse: f
     """Probabilities of none, of unknown, and by weight of the explanations as simple as the best.
 
     A p-value leaves odds of nothing of at least -e p log p (Sellke, Bayarri & Berger, American Statistician
-    55, 2001).
+    55, 2001). Prior odds of unknown are such that it is as likely as not where the verdict turns to it.
     """
 
     def odds(p: float) -> float:
         p = max(p, 1e-12)
         return 1.0 if p >= np.exp(-1) else float(-np.e * p * np.log(p))
 
-    none, unknown = odds(p_value) if best.effects else 1.0, 1 / (1 + odds(worse)) - 0.5
+    none, unknown = odds(p_value) if best.effects else 1.0, odds(UNKNOWN) / (odds(UNKNOWN) + odds(worse))
     every = {**weight, **({"+".join(sorted(best.effects)): 1.0} if best.effects else {})}
     total = max(sum(every.values()), 1e-300)
     seen = 1 - none / (1 + none) if best.effects else 0.0

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from simgap.robots.changes import (
     Changes,
     Comparison,
     Hypothesis,
+    _chances,
     _unlike,
     added_by_drift,
     by_chance,
@@ -219,3 +221,12 @@ def test_motions_missed_by_factors_are_called_unlike_as_often_as_stated():
 def test_one_old_log_is_too_few():
     with pytest.raises(InputError, match="--healthy: has 1 log; expected two"):
         changes(SIMULATOR, logs(0, ("slow",)), logs(1, ("slow",)), {})
+
+
+@pytest.mark.parametrize(
+    ("p", "likelier"), [(1e-6, "unknown"), (0.007, "unknown"), (0.02, "none"), (0.6, "none")]
+)
+def test_unknown_is_likelier_than_none_where_it_is_the_verdict(p, likelier):
+    found = _chances(SimpleNamespace(effects=()), {}, 1.0, p)
+    assert max(found, key=lambda n: found[n]) == likelier
+    assert sum(found.values()) == pytest.approx(1.0)
