@@ -238,6 +238,8 @@ def draw_course(one: Course, found: Robot, path: Path) -> None:
 def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
     """Root mean square residual by log before and after correction, cross-validated between logs if it
     was."""
+    from matplotlib.ticker import LogFormatter
+
     rows, both = found.composed.rows, residuals(found)
     logs = [r.name for r in found.composed.recordings]
     size = np.sqrt(rows.variance)
@@ -252,7 +254,7 @@ def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
         axes.axhline(1, color=GREY, lw=0.8, ls="--")
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(LogFormatter())  # within one decade only
         axes.set_xticks(at, [_short(n) for n in logs], rotation=30, ha="right", fontsize=6)
         axes.set_ylabel("rms residual [sd of noise]")
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
