@@ -93,30 +93,30 @@ def perform(plan: Plan, blocks: Mapping[str, Block], world: World) -> Motion:
     return Motion(t, q_log[:, fingers], v_log[:, fingers], force, boundaries, centres, q_log[:, turns])
 
 
+def _by_pair(model: mujoco.MjModel, pairs: list[tuple[str, str, int]]) -> np.ndarray:
+    """Number of a block (geoms, geoms) for pairs of geoms, -1 for others."""
+    out = np.full((model.ngeom, model.ngeom), -1)
+    for one, other, block in pairs:
+        a, b = model.geom(one).id, model.geom(other).id
+        out[a, b] = out[b, a] = block
+    return out
+
+
 def _bearings(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
     """For each pair of geoms, the block that stands on the other there, or -1."""
-    out = np.full((model.ngeom, model.ngeom), -1)
-    geoms = {model.geom(i).name: i for i in range(model.ngeom)}
+    pairs = []
     for k, name in enumerate(names):
+        others = [n for n in names if n != name]
         for end in (1, 2):
-            for what in ("table", *(f"box_{o}" for o in names if o != name)):
-                out[geoms[f"foot{end}_{name}"], geoms[what]] = k
-                out[geoms[what], geoms[f"foot{end}_{name}"]] = k
-            for other in names:
-                if other != name:
-                    out[geoms[f"top{end}_{other}"], geoms[f"box_{name}"]] = k
-                    out[geoms[f"box_{name}"], geoms[f"top{end}_{other}"]] = k
-    return out
+            pairs += [(f"foot{end}_{name}", what, k) for what in ("table", *(f"box_{n}" for n in others))]
+            pairs += [(f"top{end}_{n}", f"box_{name}", k) for n in others]
+    return _by_pair(model, pairs)
 
 
 def _grips(model: mujoco.MjModel, names: list[str]) -> np.ndarray:
     """For each pair of geoms, the block that a pad touches there, or -1."""
-    out = np.full((model.ngeom, model.ngeom), -1)
-    for k, name in enumerate(names):
-        box = model.geom(f"box_{name}").id
-        for tip in (model.geom(f"tip{i}{e}").id for i in (1, 2) for e in "ab"):
-            out[tip, box] = out[box, tip] = k
-    return out
+    ends = [f"tip{i}{e}" for i in (1, 2) for e in "ab"]
+    return _by_pair(model, [(end, f"box_{name}", k) for k, name in enumerate(names) for end in ends])
 
 
 def _check_touches(t: np.ndarray, touched: np.ndarray, parts: tuple[float, ...], moved: list[int]) -> None:
