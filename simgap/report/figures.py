@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogFormatter
 
 from hmmseg.plot.style import BLUE, GREY, ORANGE, RED, canvas
 from simgap.gap.diagnose import Diagnosis, channels
@@ -238,8 +239,6 @@ def draw_course(one: Course, found: Robot, path: Path) -> None:
 def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
     """Root mean square residual by log before and after correction, cross-validated between logs if it
     was."""
-    from matplotlib.ticker import LogFormatter
-
     rows, both = found.composed.rows, residuals(found)
     logs = [r.name for r in found.composed.recordings]
     size = np.sqrt(rows.variance)

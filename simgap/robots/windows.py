@@ -84,10 +84,8 @@ def cut(
         rests = touching & resting(log, reach)
         turns = np.flatnonzero(np.diff(rests.astype(int))) + 1
         contacts = getattr(simulator, "contacts", None)
-        step = np.diff(log.t)
-        gaps = (
-            np.flatnonzero(step > GAP * np.median(step)) + 1
-        )  # of what was commanded there nothing is known
+        step = np.diff(log.t)  # in a gap nothing is known of the commands
+        gaps = np.flatnonzero(step > GAP * np.median(step)) + 1
         marks = [*([] if contacts is None else map(float, contacts(log))), *log.t[turns], *log.t[gaps]]
         edges = _edges(log, marks, length)
         edges[0] = _readable(simulator, log, edges[1])
