@@ -53,7 +53,6 @@ NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
 SETTLED = 0.3  # numerics: nats to which the best set is fitted in the end, as three rule others out
-ASTRAY = 0.1  # numerics: difference of the numerics' parameters, of order one, that may be another optimum
 NEAR_BY = 20.0  # numerics: nats of the best set within which others are fitted to the end
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
@@ -150,25 +149,11 @@ class Search:
         return self._settled(best)
 
     def _settled(self, best: FittedSet) -> FittedSet:
-        """The best set, it and all that come near fitted to the end from the same numerics.
-
-        Of shares of a step by which commands may be late there are several local optima, and sets that differ
-        in them cannot be compared.
-        """
+        """The best set, fitted to the end."""
         if best.promise > best.score + SETTLED:
             best = self.fit(best.names, best.point, [best.whiten])
-        numerics = {name: best.point[name] for name in self.along}
-        for one in [*self.fitted.values()]:
-            if self._strays(one, best) and one.promise > best.score - NEAR_BY:
-                self.fit(one.names, {**one.point, **numerics}, [one.whiten])
         leading = max(self.fitted.values(), key=lambda one: one.score)
         return self._with_less(leading) if self._is_better(leading, best) else best
-
-    def _strays(self, one: FittedSet, best: FittedSet) -> bool:
-        """Whether a set's numerics are elsewhere than the best set's; what is linear has one optimum."""
-        bent = [n for n in self.along if not self.composed.effects[n].dear]
-        size = [abs(v - best.point[n][k]) for n in bent for k, v in one.point[n].items()]
-        return max(size, default=0.0) > ASTRAY
 
     def forced(self, names: Names) -> FittedSet:
         """A given set at its best."""
