@@ -98,6 +98,14 @@ class World(NamedTuple):
     dead_band: DeadBand | None = None
 
 
+PAD = 5e-3  # prior: m; half a pad's length, which with its stiffness determines how easily it turns
+
+
+def turning_compliance(stiffness: float) -> float:
+    """How easily both pads, as rows of springs of this total normal stiffness [N/m], turn [rad/(N m)]."""
+    return 3 / (2 * stiffness * PAD**2)
+
+
 LATE, SMOOTH, CREEPING, SLIDING, RINGING, YIELDING = range(6)
 
 

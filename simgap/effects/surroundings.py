@@ -13,6 +13,7 @@ from simgap.effects.base import (
     Performance,
     World,
     flat,
+    turning_compliance,
     with_force,
     with_mode,
 )
@@ -39,8 +40,14 @@ OBJECT_INERTIA = HandEffect(
 
 
 def _apply_offcentre_mass(performance: Performance, values, rng) -> Performance:
-    more = performance.carried * values["offset"] / performance.width
-    return with_force(performance, flat(performance) + more[:, None] * np.array([0.0, -1.0, 0.0, 1.0]))
+    """Fingers that stay where they are shear their pads as the block turns between them."""
+    pad, width, force = performance.rig.fingertip, performance.width, flat(performance)
+    give = 1 / pad.shear_stiffness
+    apart = performance.position[:, 1, 1] - performance.position[:, 0, 1] - give * (force[:, 3] - force[:, 1])
+    moment = (force[:, 0] - force[:, 2]) / 2 * apart + (force[:, 3] - force[:, 1]) * width / 2
+    yields = width**2 / (width**2 + 2 * give / turning_compliance(pad.normal_stiffness))
+    more = np.where(performance.carried > 0, yields * (performance.carried * values["offset"] - moment), 0.0)
+    return with_force(performance, force + (more / width)[:, None] * np.array([0.0, -1.0, 0.0, 1.0]))
 
 
 OFFCENTRE_MASS = HandEffect(

@@ -370,7 +370,7 @@ def together(
 
 def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
     """The effects of a joint fit as separate candidates."""
-    k = given.num_properties
+    k = given.num_common
     # The shift by all of them.
     all_of_them = healthy.residual - joint.residual - healthy.jacobian @ (healthy.u[:k] - joint.u[:k])
     alone = []
@@ -403,7 +403,7 @@ def after(
         one, own = _shifting(problem, first, healthy), []
         for f in joint:
             both = _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
-            by_first = one.shift + one.jacobian @ (f.u[first.columns[problem.num_properties :]] - one.at)
+            by_first = one.shift + one.jacobian @ (f.u[first.columns[problem.num_common :]] - one.at)
             mine = slice(first.columns.size, None)
             own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - by_first,
                                   f.jacobian[:, mine], f.doubts - first.doubts))  # fmt: skip
@@ -451,7 +451,7 @@ def _at_nominal(f: Fitted, healthy: Fitted) -> np.ndarray:
 
 def _shifting(given: Problem, f: Fitted, healthy: Fitted) -> Candidate:
     """A fit of one effect as a candidate: its shift with properties at their nominal values."""
-    k, shift = given.num_properties, _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
+    k, shift = given.num_common, _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
     doubts = f.doubts - healthy.doubts
     return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.jacobian[:, k:], doubts)
 

@@ -426,7 +426,7 @@ def _together(found: Search, which: Sequence[Candidate]) -> Fitted:
     u, keys = found.healthy.u.copy(), []
     for c in which:
         keys.append(next(key for key in forms_of(c.name) if free_parameters(key) == c.parameters))
-        u[columns_of(found.problem, keys[-1:])[found.problem.num_properties :]] = c.at
+        u[columns_of(found.problem, keys[-1:])[found.problem.num_common :]] = c.at
     return fit(found.problem, tuple(keys), u)
 
 

@@ -15,8 +15,6 @@ from simgap.gap.frame import CHANNELS
 from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, residual_of, slots
 from simgap.phases import Phase
 
-PAD = 5e-3  # prior: m; half a pad's length, which with its stiffness determines how easily it turns
-STANCES = (0.6, 1.0)  # prior: distance between a block's feet over its width; values between are a mixture
 SWING = 2e-3  # prior: rad; sd of the angle of a lifted block relative to how it stood
 LANDING = 4e-5  # prior: m; sd of a pad's slip in the shock of landing
 BEYOND = 5e-3  # prior: kg; sd of a pad's mass in front of its sensor, whose weight was tared
@@ -29,14 +27,14 @@ def with_nuisances(given: Problem) -> Problem:
     the recordings it may not be zero (`simgap.gap.assemble`).
     """
     columns = [
-        *_admitted(given), *_inertial(given), *_late_rates(given), *_turning(given), *_settling(given)
+        *_admitted(given), *_inertial(given), *_late_rates(given), *_settling(given)
     ]  # fmt: skip
     return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))
 
 
 def _admitted(given: Problem) -> list[np.ndarray]:
     """Columns (n, .) of what rig.toml admits under [systematic]."""
-    out, k = [], given.num_properties
+    out, k = [], given.num_common
     for slot in slots(k)[0]:
         if slot.effect.admitted is None:
             continue
@@ -99,33 +97,6 @@ def _quieter(given: Problem, speed: np.ndarray, difference: np.ndarray, step: fl
         shaken = np.median(sample[..., CHANNELS.index(place)]) / step
         if shaken < np.median(sample[..., CHANNELS.index(rate)]):
             out[..., k] = difference[..., k]
-    return out
-
-
-def _turning(given: Problem) -> list[np.ndarray]:
-    """Columns (n, 1) of blocks that turn in the grip: the fingers' offset changes by width times angle.
-
-    Balance of moments about the block's middle: the shears of both fingers and the couple of grips at unequal
-    heights turn a block against the pads unless its support holds it upright. The load of the support acts
-    within the feet, so it withstands a moment up to the load times half the stance; beyond that the block
-    tips about a foot and its middle rises. How easily pads turn is no fault.
-    """
-    world, arrays = given.frame.world, given.frame.arrays
-    stiffness = 1 / np.maximum(world.give_normal.mean(), 1e-9)
-    compliance = 3 / (2 * stiffness * PAD**2)  # rad/(N m) of both pads as rows of springs
-    weight, width = (
-        np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, k]) for k in (0, 1)
-    )
-    position = tips(world)[0]
-    fx1, fy1, fx2, fy2 = np.moveaxis(world.force, -1, 0)
-    apart = position[..., 3] - position[..., 1] - (fy2 * world.give_shear[1] - fy1 * world.give_shear[0])
-    moment = width / 2 * (fy2 - fy1) + (fx1 - fx2) / 2 * apart
-    load = np.maximum(weight - fy1 - fy2, 0.0) * (1 - world.carry)
-    out = []
-    for share in STANCES:
-        stance = share * width / 2
-        turn = compliance * np.sign(moment) * np.maximum(np.abs(moment) - load * stance, 0.0)
-        out.append(_column(given, {"offset": width * turn, "y": stance * np.abs(turn) * (1 - world.carry)}))
     return out
 
 

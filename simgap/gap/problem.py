@@ -15,9 +15,9 @@ from simgap.attribution.problem import Rows, cosines
 from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.effects import catalogue, free_parameters, name_of
-from simgap.effects.base import HandEffect, World
+from simgap.effects.base import HandEffect, World, turning_compliance
 from simgap.gap.frame import CHANNELS, Frame
-from simgap.gap.residuals import contact, residuals
+from simgap.gap.residuals import STANCES, contact, residuals
 
 # Linear unknowns with a normal prior, integrated out of a least-squares problem.
 
@@ -69,9 +69,9 @@ class Slot:
 
 
 @lru_cache
-def slots(num_properties: int) -> tuple[tuple[Slot, ...], int]:
+def slots(num_common: int) -> tuple[tuple[Slot, ...], int]:
     """Slots of all deterministic effects in order of correction, and the number of columns."""
-    out, at = [], num_properties
+    out, at = [], num_common
     known = [e for e in catalogue().values() if e.correct is not None]
     for effect in sorted(known, key=lambda e: (e.stage, e.name)):
         out.append(Slot(effect, at))
@@ -103,9 +103,13 @@ class Problem:
         return self.nuisances.product(a, b) if self.nuisances.columns.size else a.T @ b
 
     def properties(self, u: np.ndarray) -> np.ndarray:
-        """Weight, width and height (..., O, 3) of the blocks at coordinates (..., all columns)."""
-        own = u[..., : self.num_properties]
-        return self.centre + self.sd * own.reshape(*own.shape[:-1], *self.centre.shape)
+        """Weight, width and height (O, 3) of the blocks at coordinates (all columns)."""
+        return self.centre + self.sd * u[: self.centre.size].reshape(self.centre.shape)
+
+    def turning(self, u: np.ndarray) -> np.ndarray:
+        """How easily a block turns in the grip [rad/(N m)], by share of its width on which it stands."""
+        pad = self.frame.rig.fingertip
+        return turning_compliance(pad.normal_stiffness) * u[self.centre.size : self.num_common]
 
     @cached_property
     def there(self) -> np.ndarray:
@@ -118,9 +122,9 @@ class Problem:
         return 1 / np.where(self.there, self.weight, 1.0)
 
     @property
-    def num_properties(self) -> int:
-        """Number of property columns."""
-        return self.centre.size
+    def num_common(self) -> int:
+        """Number of columns that every fit has: properties, and how easily blocks turn in the grip."""
+        return self.centre.size + len(STANCES)
 
     @property
     def size(self) -> int:
@@ -177,7 +181,7 @@ def free_of(key: str) -> list[Parameter]:
 
 def neutral(given: Problem) -> np.ndarray:
     """Coordinates of no effect, with properties at the centre of their prior."""
-    places, total = slots(given.num_properties)
+    places, total = slots(given.num_common)
     u = np.zeros(total)
     for slot in places:
         for j, p in enumerate(slot.effect.parameters.values()):
@@ -188,8 +192,8 @@ def neutral(given: Problem) -> np.ndarray:
 
 def columns_of(given: Problem, effects: Sequence[str]) -> np.ndarray:
     """Columns of the properties and of the free parameters of effects' forms."""
-    out = [np.arange(given.num_properties)]
-    places = {s.effect.name: s for s in slots(given.num_properties)[0]}
+    out = [np.arange(given.num_common)]
+    places = {s.effect.name: s for s in slots(given.num_common)[0]}
     for key in effects:
         slot, names = places[name_of(key)], free_parameters(key)
         out.append(np.array([slot.start + j for j, n in enumerate(slot.effect.parameters) if n in names]))
@@ -198,7 +202,7 @@ def columns_of(given: Problem, effects: Sequence[str]) -> np.ndarray:
 
 def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of all coordinates."""
-    places, total = slots(given.num_properties)
+    places, total = slots(given.num_common)
     low, high = np.full(total, -np.inf), np.full(total, np.inf)
     for slot in places:
         for j, p in enumerate(slot.effect.parameters.values()):
@@ -249,7 +253,7 @@ STEP = 1e-5  # numerics: step of finite differences, in prior standard deviation
 def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
     """The recorded world corrected for effects at coordinates u (all columns)."""
     world, names = given.frame.world, {name_of(key) for key in effects}
-    for slot in slots(given.num_properties)[0]:
+    for slot in slots(given.num_common)[0]:
         if slot.effect.name in names:
             each = enumerate(slot.effect.parameters.values())
             values = {p.name: p.value(u[slot.start + j]) for j, p in each}
@@ -257,7 +261,7 @@ def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> W
     return world
 
 
-def whitened(given: Problem, world: World, properties: np.ndarray) -> tuple[np.ndarray, float]:
+def whitened(given: Problem, world: World, u: np.ndarray) -> tuple[np.ndarray, float]:
     """Whitened residuals (T, N, C) of a corrected world, and the cost of doubts [nats].
 
     A residual in doubt has a larger variance; half the log of this factor is its cost.
@@ -265,21 +269,21 @@ def whitened(given: Problem, world: World, properties: np.ndarray) -> tuple[np.n
     Args:
         given: The problem.
         world: The world, corrected for effects.
-        properties: Weight, width and height (O, 3).
+        u: Coordinates, of which those that every fit has count.
     """
-    raw, factor, unseen = residuals(world, given.frame.arrays, properties, given.noise)
+    raw, factor, unseen = _residuals(given, world, u)
     cost = unseen + 0.5 * float(np.log(factor[given.there]).sum())
     return raw / np.sqrt(factor) * given.weight, cost
 
 
 def residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Whitened residuals (T, N, C) of a candidate at coordinates u."""
-    return whitened(given, _without_effects(given, effects, u), given.properties(u))[0]
+    return whitened(given, _without_effects(given, effects, u), u)[0]
 
 
 def residual_of(given: Problem, world: World) -> np.ndarray:
     """Whitened residuals (n,) of a corrected world, with properties at the centre of their prior."""
-    return whitened(given, world, given.properties(neutral(given)))[0][given.there]
+    return whitened(given, world, neutral(given))[0][given.there]
 
 
 def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
@@ -290,8 +294,12 @@ def world_without(given: Problem, effects: Sequence[str], u: np.ndarray) -> Worl
 
 def raw_residual_at(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
     """Residuals (T, N, C) of a candidate in units of their channels."""
-    world = _without_effects(given, effects, u)
-    return residuals(world, given.frame.arrays, given.properties(u), given.noise)[0]
+    return _residuals(given, _without_effects(given, effects, u), u)[0]
+
+
+def _residuals(given: Problem, world: World, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Residuals (`simgap.gap.residuals`) of a corrected world."""
+    return residuals(world, given.frame.arrays, given.properties(u), given.turning(u), given.noise)
 
 
 @dataclass(frozen=True)
@@ -327,8 +335,8 @@ def cost_at(
 
     Properties at the columns `mine` have normal priors, each of the `blocks` of them a Cauchy distribution.
     """
-    left, doubts = whitened(given, _without_effects(given, effects, u), given.properties(u))
-    left, own = left[given.there], u[mine[: given.num_properties]]
+    left, doubts = whitened(given, _without_effects(given, effects, u), u)
+    left, own = left[given.there], u[mine[: given.num_common]]
     cost = 0.5 * float(given.product(left, left)) + doubts + 0.5 * float(own @ own)
     for block in blocks:
         x = u[mine[block]]
@@ -355,13 +363,13 @@ def evaluated(
         at: Result of `cost_at`, if known.
     """
     at = cost_at(given, effects, u, mine) if at is None else at
-    k, step, properties, each = given.num_properties, u.copy(), given.properties(u), []
+    k, step, each = given.num_common, u.copy(), []
     if usual is None:  # properties need no further correction
         world = _without_effects(given, effects, u)
-        each += [whitened(given, world, row) for row in given.properties(u + STEP * np.eye(k, u.size))]
+        each += [whitened(given, world, row) for row in u + STEP * np.eye(k, u.size)]
     for column in mine[k:]:
         step[column] += STEP
-        each.append(whitened(given, _without_effects(given, effects, step), properties))
+        each.append(whitened(given, _without_effects(given, effects, step), u))
         step[column] = u[column]
     z = np.array([residual[given.there] for residual, _ in each]).reshape(len(each), given.size)
     jacobian, doubt_slope = (z - at[0]).T / STEP, (np.array([doubt for _, doubt in each]) - at[1]) / STEP
@@ -405,7 +413,7 @@ def fit(
     low, high = (edge[mine] for edge in limits(given))
     u = u.copy()
     u[mine] = np.clip(u[mine], low, high)
-    blocks, at = [], given.num_properties
+    blocks, at = [], given.num_common
     for key in effects:
         blocks.append(np.arange(at, at + len(free_parameters(key))))
         at += blocks[-1].size

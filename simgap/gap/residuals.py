@@ -287,11 +287,12 @@ def _wider(values: np.ndarray) -> np.ndarray:
 
 TOUCH = 2e-5  # numerics: m; the onset of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # chosen: sds of the distance by which fingers must be closer than the block's width to touch it
+STANCES = (0.6, 1.0)  # prior: distance between a block's feet over its width; values between are a mixture
 CLOSED = 0.8  # chosen: share of its usual force at which a grip has closed: until then it pushes the block
 
 
 def residuals(
-    world: World, arrays: Arrays, properties: np.ndarray, noise: np.ndarray
+    world: World, arrays: Arrays, properties: np.ndarray, turning: np.ndarray, noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Residuals of the contact equations.
 
@@ -299,6 +300,7 @@ def residuals(
         world: The world, corrected for effects.
         arrays: Constants of the equations.
         properties: Weight [N], width and height [m] of the blocks (O, 3).
+        turning: How easily blocks turn in the grip [rad/(N m)], for each of STANCES.
         noise: Standard deviation (T, N, C) of the residuals.
 
     Returns:
@@ -313,12 +315,13 @@ def residuals(
     pads = relaxed(world, force)
     x1, y1, x2, y2 = (position[..., k] for k in range(4))
     fx1, fy1, fx2, fy2 = (pads[..., k] for k in range(4))
-    couple = world.couple * weight / np.maximum(width, 1e-3) * world.carry
-    fy1, fy2 = fy1 + couple, fy2 - couple
     (n1, n2), (s1, s2) = world.give_normal, world.give_shear
 
     pads_give = Pads(n1, n2, s1, s2)
-    gap = x2 - x1 - width
+    apart = block_offset(y2 - y1, fy1, fy2, pads_give)
+    turn, tipped = turned(world, weight, width, turning, force, apart)
+    # Grips at unequal heights are nearer to each other on a block that turns towards the lower one.
+    gap = x2 - x1 - width + turn * (apart - width * turn / 2)
     squeeze = block_width(0.0, fx1, fx2, pads_give)
     # Pads that have crept recover late: fingers may be closer for a while without pressing.
     late = (pads - force)[..., 0] * n1 - (pads - force)[..., 2] * n2
@@ -330,11 +333,11 @@ def residuals(
     # In a firm grip the fingers are as far apart as the block is wide, pads or none; else only not closer.
     distance = firm * (squeeze + gap) + (1 - firm) * (squeeze - late - touching)
     place = arrays.phase[..., Phase.PLACE]
-    offset = block_offset(y2 - y1, fy1, fy2, pads_give) + world.hang * width * world.carry
+    offset = apart + world.hang * width * world.carry - width * turn
     x = block_x((x1 + x2) / 2, fx1, fx2, pads_give)
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + sunk(world, load)
-    y = y - np.tan(world.tilt) * (x1 + x2) / 2 - rise * place
+    y = y - np.tan(world.tilt) * (x1 + x2) / 2 - tipped - rise * place
     # Closing fingers push the block and slide on it; it rests only once both hold it.
     lesser = np.minimum(force[..., 0], -force[..., 2])
     both = firmness(lesser, held, arrays.onehot, CLOSED)
@@ -372,6 +375,35 @@ def residuals(
         np.concatenate([factor, np.ones_like(speeds), 1 + either / np.square(noise[..., 6:])], -1),
         unseen,
     )
+
+
+def turned(
+    world: World, weight: np.ndarray, width: np.ndarray, turning: np.ndarray, force: np.ndarray,
+    apart: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Angle (T, N) [rad] by which a block turns in the grip to the left, and how far (T, N) [m] it rises.
+
+    Balance of moments about the block's middle: shears of the fingers, the couple of grips at unequal heights
+    and a mass off the middle turn a block against the pads unless its support holds it upright. The load of
+    the support acts within the feet, so it withstands a moment up to the load times half the stance; beyond
+    that the block tips about a foot and its middle rises.
+
+    Args:
+        world: The world, corrected for effects.
+        weight, width: Of the nearest block (T, N) [N, m].
+        turning: Compliance [rad/(N m)] for each of STANCES.
+        force: Contact forces (T, N, 4) [N].
+        apart: Height (T, N) of the right contact over the left [m].
+    """
+    grip, shear = (force[..., k] - force[..., 2 + k] for k in (0, 1))
+    moment = grip / 2 * apart - shear * width / 2 - weight * world.couple
+    load = np.maximum(weight - force[..., 1] - force[..., 3], 0.0) * (1 - world.carry)
+    turn, rise = np.zeros_like(weight), np.zeros_like(weight)
+    for share, compliance in zip(STANCES, turning, strict=True):
+        stance = share * width / 2
+        by = compliance * np.sign(moment) * np.maximum(np.abs(moment) - load * stance, 0.0)
+        turn, rise = turn + by, rise + stance * np.abs(by) * (1 - world.carry)
+    return turn, rise
 
 
 def _doubt(world: World, firm: np.ndarray) -> np.ndarray:

@@ -60,7 +60,7 @@ def shifting(names: Sequence[str]) -> list[str]:
 
 def _gridded(given: Problem, key: str) -> list[tuple[int, Parameter]]:
     """Columns and parameters of an effect's form that are started from every point of a grid."""
-    own = columns_of(given, (key,))[given.num_properties :]
+    own = columns_of(given, (key,))[given.num_common :]
     return [(int(c), p) for c, p in zip(own, free_of(key), strict=True) if p.gridded]
 
 
@@ -90,8 +90,8 @@ def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMI
         healthy: The fit to start from.
         promising: Gain of a linear step [nats] below which the start is not refined.
     """
-    base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_properties]
-    base[: given.num_properties][given.measured.ravel()] = 0.0
+    base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_common]
+    base[: given.measured.size][given.measured.ravel()] = 0.0
     drawn = np.abs(healthy.u - base).max() > SURE  # more than the uncertainty of a touch
     effects = (*healthy.effects, key)
     every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
@@ -121,7 +121,7 @@ def _linear_step(
     there = u.copy()
     there[columns] = np.clip(u[columns] + step, low[columns], high[columns])
     left = now.residual + now.jacobian @ (there[columns] - u[columns])
-    own = there[: given.num_properties]
+    own = there[: given.num_common]
     cost = 0.5 * float(given.product(left, left)) + now.doubts + 0.5 * float(own @ own)
     return cost, there
 

@@ -120,7 +120,7 @@ def test_pads_that_swallow_noise_gain_what_they_swallow(given):
     healthy = fit(given, (), neutral(given))
     stiff = fit(given, ("fingertip_compliance",), healthy.u, 0)
     u = stiff.u.copy()
-    own = stiff.columns[given.num_properties :]
+    own = stiff.columns[given.num_common :]
     u[own[-1]] -= 2.0  # stiffer in shear by two usual deviations
     stiff = fit(given, ("fingertip_compliance",), u, 0)
     others = redrawn(given)

@@ -24,7 +24,7 @@ def read(name):
 
 
 def own(given, found, name):
-    slot = next(s for s in slots(given.num_properties)[0] if s.effect.name == name)
+    slot = next(s for s in slots(given.num_common)[0] if s.effect.name == name)
     values = {
         p.name: float(p.value(found.u[slot.start + j])) for j, p in enumerate(slot.effect.parameters.values())
     }
@@ -82,7 +82,7 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
     joint = fit(given, names, neutral(given))
     gap = together(given, gap_of(given, plain, []), plain, joint)
     assert [c.name for c in gap.candidates] == list(names)
-    left = gap.residual - gap.nuisance[:, : given.num_properties] @ joint.u[: given.num_properties]
+    left = gap.residual - gap.nuisance[:, : given.num_common] @ joint.u[: given.num_common]
     left = left - sum(c.shift for c in gap.candidates)
     np.testing.assert_allclose(left, joint.residual, atol=1e-8)
 
@@ -97,7 +97,7 @@ def test_an_effect_fitted_after_another_adds_to_it_what_both_take_off(healthy):
     gap = after(given, gap_of(given, plain, [first]), plain, first, [joint], ())
     one, other = gap.candidates
     assert (one.name, other.name) == ("fingertip_compliance", "link_length")
-    k = given.num_properties
+    k = given.num_common
     left = gap.residual - gap.nuisance[:, :k] @ joint.u[:k] - other.shift
     left = left - one.shift - one.jacobian @ (joint.u[first.columns[k:]] - one.at)
     np.testing.assert_allclose(left, joint.residual, atol=1e-8)
@@ -126,7 +126,7 @@ def test_what_the_rig_admits_is_a_nuisance():
         update={"systematic": frame.rig.systematic.model_copy(update={"force_bias": (0.02, 0.0, 0.0, 0.01)})}
     )
     given = with_nuisances(problem(replace(frame, rig=rig)))
-    k = given.num_properties
+    k = given.num_common
     push = derivatives(given, ("force_bias",), neutral(given))[:, k:]
     np.testing.assert_allclose(given.nuisances.columns[:, :2], -push[:, [0, 3]] * [0.2, 0.1], rtol=1e-6)
 

@@ -14,9 +14,9 @@ from simgap.effects.base import gradient, swung, tips
 from simgap.gap.assemble import _density, _likeliest, with_noise
 from simgap.gap.assemble import _turning as turned_variance
 from simgap.gap.frame import CHANNELS, build
-from simgap.gap.nuisances import BEYOND, _inertial, _late_rates, _settling, _turning
+from simgap.gap.nuisances import BEYOND, _inertial, _late_rates, _settling
 from simgap.gap.problem import Nuisances, problem
-from simgap.gap.residuals import residuals
+from simgap.gap.residuals import residuals, turned
 from simgap.phases import Phase
 
 
@@ -62,18 +62,44 @@ def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
 
 
 @double_precision
-def test_blocks_turn_and_settle_in_the_offset_and_height_alone(given):
-    there = given.there
-    channel = np.nonzero(there)[2]
-    carried = np.broadcast_to(given.frame.arrays.phase[..., 2:3] > 0, there.shape)[there]
-    turning, settling = _turning(given), _settling(given)
-    moves = given.frame.num_trials * given.frame.arrays.onehot.shape[2]
-    assert len(turning) == 2 and len(settling) == 3 * moves
-    for column in (*turning, *settling):
+def test_blocks_settle_in_the_offset_and_height_alone(given):
+    channel, settling = np.nonzero(given.there)[2], _settling(given)
+    assert len(settling) == 3 * given.frame.num_trials * given.frame.arrays.onehot.shape[2]
+    for column in settling:
         assert set(channel[np.abs(column[:, 0]) > 1e-9]) <= {CHANNELS.index("offset"), CHANNELS.index("y")}
-    # Firmly on its support a block does not turn: the offset moves in the air.
-    mine = channel == CHANNELS.index("offset")
-    assert turning[1][mine & carried].std() > 0
+
+
+@pytest.mark.parametrize("off", [0.0, 0.004, -0.002])
+def test_a_lifted_block_turns_until_its_moments_balance(given, off):
+    """Oracle: the linear equations of a block between two springs that shear and turn, solved by hand."""
+    weight, width, give, grip, heights, compliance = 0.4, 0.02, 1 / 2000, 3.0, 0.003, 8.0
+    apart = heights + 0.0005  # of the tips; what the contacts are not apart is shear of the pads
+    # turn / compliance = grip (heights + width turn) + width / 2 (fy2 - fy1) - weight off,
+    # fy2 - fy1 = (apart - heights - width turn) / give
+    rate = 1 / compliance - grip * width + width**2 / (2 * give)
+    turn = (grip * heights + width / 2 * (apart - heights) / give - weight * off) / rate
+    lift = (apart - heights - width * turn) / give
+    force = np.array([[[grip, (weight - lift) / 2, -grip, (weight + lift) / 2]]])
+    world = given.frame.world._replace(couple=np.asarray(off), carry=np.ones((1, 1)))
+    one = np.ones((1, 1))
+    found, rise = turned(
+        world,
+        weight * one,
+        width * one,
+        np.array([0.3, 0.7]) * compliance,
+        force,
+        one * (heights + width * turn),
+    )
+    assert found[0, 0] == pytest.approx(turn)
+    assert rise[0, 0] == 0.0
+
+
+def test_a_standing_block_turns_only_once_its_load_leaves_its_feet(given):
+    world, one = given.frame.world._replace(carry=np.zeros((1, 1))), np.ones((1, 1))
+    for apart, tips_over in ((1e-4, False), (3e-3, True)):
+        force = np.array([[[4.0, 0.05, -4.0, 0.05]]])
+        turn, rise = turned(world, 0.4 * one, 0.02 * one, np.array([5.0, 0.0]), force, apart * one)
+        assert (turn[0, 0] > 0) == (rise[0, 0] > 0) == tips_over
 
 
 @double_precision
@@ -149,8 +175,8 @@ def test_a_block_that_a_moving_hand_takes_along_stays_there(given):
         pushed = arrays.pushed.copy()
         pushed[0, at] += seen
         other = arrays._replace(pushed=pushed)
-        raw, factor, _ = residuals(_moved(world, by), other, given.centre, given.noise)
-        usual, _, _ = residuals(world, other, given.centre, given.noise)
+        raw, factor, _ = residuals(_moved(world, by), other, given.centre, np.zeros(2), given.noise)
+        usual, _, _ = residuals(world, other, given.centre, np.zeros(2), given.noise)
         after = mine[mine > at]  # a filter is off where the step is, and knows it
         left[seen] = float(np.abs(raw - usual)[0, after, x].max())
         assert (factor[0, at, x] > 5) == (seen > 0)
@@ -161,7 +187,9 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
     world, arrays = given.frame.world, given.frame.arrays
     tilted = catalogue()["table_tilt"].correct(world, {"angle": 0.02, "turned": 0.8}, 1.0)
     offset, width = CHANNELS.index("offset"), arrays.onehot @ (arrays.objects @ given.centre[:, 1])
-    change = [residuals(w, arrays, given.centre, given.noise)[0][..., offset] for w in (world, tilted)]
+    change = [
+        residuals(w, arrays, given.centre, np.zeros(2), given.noise)[0][..., offset] for w in (world, tilted)
+    ]
     change = (change[1] - change[0])[0] * (arrays.there[0, :, offset] > 0)
     held, move = arrays.onehot[0, :, 0] > 0, width[0][arrays.onehot[0, :, 0] > 0][0]
     there = held & (arrays.there[0, :, offset] > 0)

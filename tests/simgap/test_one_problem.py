@@ -34,7 +34,7 @@ def test_properties_without_an_effect_are_those_identified(source):
     found = identify_aligned(aligned)
     given = problem(build(aligned))
     healthy = fit(given, (), neutral(given))
-    values = given.centre + given.sd * healthy.u[: given.num_properties].reshape(-1, 3)
+    values = given.properties(healthy.u)
     assert len(found.names) == 6
     for obj, prop in found.names:
         draws = found.of(obj, prop)
