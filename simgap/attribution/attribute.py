@@ -251,7 +251,7 @@ def attribute(
     somewhere = verdict.verdict != "none" or small is not None
     return Attribution(
         **vars(verdict),
-        effects=_effects(f, models, chance, examined),
+        effects=_effects(f, models, chance, examined, _alone(f, verdict.causes)),
         detection=detection,
         remainder=Remainder(remains, p_rest, unexplained),
         where=significant(gap.rows, f.spectrum.band, before, sd) if somewhere else (),
@@ -307,6 +307,11 @@ def _forced(f: Forms, names: tuple[str, ...]) -> Model:
     for name in names:
         if name not in possible:
             raise InputError(f"effect {name!r}", "cannot act on these recordings", ", ".join(possible))
+    return _alone(f, names)
+
+
+def _alone(f: Forms, names: Iterable[str]) -> Model:
+    """The best fit of these effects and no others, one form of each."""
     forms_of = [[j for j, c in enumerate(f.gap.candidates) if c.name == name] for name in names]
     sets = {tuple(sorted(each)) for each in product(*forms_of)}
     return max((fitted(f, each) for each in sets), key=lambda m: m.score)
@@ -403,8 +408,13 @@ def _needed(f: Forms, model: Model, effect: int) -> bool:
 
 def _effects(
     f: Forms, models: list[Model], chances: dict[str, float], examined: dict[tuple[int, ...], _Examined],
+    named: Model,
 ) -> dict[str, EffectPosterior]:  # fmt: skip
-    """Posterior of every effect, from the best set that has it, else from a fit of it alone."""
+    """Posterior of every effect, from the best set that has it, else from a fit of it alone.
+
+    Parameters of the causes are those of the causes alone (`named`): of a set that can spare some of its
+    effects they would be given that those act.
+    """
     out: dict[str, EffectPosterior] = {}
     forms_of: dict[str, list[int]] = {}
     for j, c in enumerate(f.gap.candidates):
@@ -412,17 +422,19 @@ def _effects(
     for name, mine in forms_of.items():
         inside = [m for m in models if {*mine} & {*m.effects}]
         examination = next((one for part, one in examined.items() if {*mine} & {*part}), None)
+        share, interval = 0.0, (0.0, 0.0)
         if examination is not None:
             model = examination.model
+            part = next(k for k, j in enumerate(model.effects) if j in mine)
+            share, interval = examination.shares.of_effect(part)
         elif inside:
             model = inside[0]
         else:
             model = max((fitted(f, (j,)) for j in mine), key=lambda m: m.score)
+        if {*mine} & {*named.effects}:
+            model = named
         j = next(iter({*mine} & {*model.effects}))
         c = f.gap.candidates[j]
-        share, interval = 0.0, (0.0, 0.0)
-        if examination is not None:
-            share, interval = examination.shares.of_effect(examination.model.effects.index(j))
         own = coordinates(f, model.effects)[j]
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]

@@ -71,7 +71,7 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
     position = tips(world)[0]
     place = (position[..., :2] + position[..., 2:]) / 2
     # From the quieter of the two: a column with the residual's own noise would be fitted to smooth it.
-    calm = _quieter(given, mean, gradient(world.t, place), step)
+    calm = _quieter(mean, gradient(world.t, place))
     rate = gradient(world.t, calm)
     bend = gradient(world.t, rate)
     # The velocity of a drive that differentiates its own readings from sample to sample.
@@ -90,14 +90,13 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
     return out
 
 
-def _quieter(given: Problem, speed: np.ndarray, difference: np.ndarray, step: float) -> np.ndarray:
-    """Velocities (T, N, 2) as read or as differences of positions, whichever have less noise."""
-    sample, out = given.frame.arrays.sample, speed.copy()
-    for k, (place, rate) in enumerate((("x", "vx"), ("y", "vy"))):
-        shaken = np.median(sample[..., CHANNELS.index(place)]) / step
-        if shaken < np.median(sample[..., CHANNELS.index(rate)]):
-            out[..., k] = difference[..., k]
-    return out
+def _quieter(speed: np.ndarray, difference: np.ndarray) -> np.ndarray:
+    """Velocities (T, N, 2) as read or as differences of positions, whichever are less rough.
+
+    Differences of positions show noise of angles and errors of the clock, velocities their own noise.
+    """
+    rough = [np.square(np.diff(values, n=3, axis=1)).mean((0, 1)) for values in (speed, difference)]
+    return np.where(rough[1] < rough[0], difference, speed)
 
 
 def _settling(given: Problem) -> list[np.ndarray]:
