@@ -222,7 +222,8 @@ def _numerics(body: Body) -> str:
     known = {
         "option.timestep": "the error of the solver's step by {:+.0%}",
         "option.integrator": "{:.0%} of another integrator's error",
-        "option.late": "commands come {:.2f} of a sample late",
+        "option.late": "commands come {:.2f} of the simulator's step late",
+        "option.smooth": "{:.0%} of each command is the mean of those before and after it",
         "option.hold": "commands are held {:.0%} of the way from a step to a line",
     }
     parts = [

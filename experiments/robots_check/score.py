@@ -54,7 +54,7 @@ def held_back(one: Mapping[str, Any]) -> bool:
 
 
 def covered(one: Mapping[str, Any]) -> list[bool]:
-    """Whether intervals contain the sizes of rightly named faults, where units agree."""
+    """Whether intervals contain the sizes of rightly named faults, where the cause has that parameter."""
     out = []
     same = {"delay": "delay", "read_gain": "gain", "read_bias": "bias", "read_lag": "delay", "gain": "gain"}
     effects = one["found"]["effects"]
@@ -62,8 +62,6 @@ def covered(one: Mapping[str, Any]) -> list[bool]:
         for name in fault["right"]:
             if fault["kind"] in same and name in one["found"]["causes"] and name in effects:
                 known = effects[name]["parameters"].get(same[fault["kind"]])
-                if known is None and len(effects[name]["parameters"]) == 1:
-                    known = next(iter(effects[name]["parameters"].values()))
                 if known is not None:
                     out.append(known["interval_90"][0] <= fault["size"] <= known["interval_90"][1])
     return out

@@ -252,7 +252,8 @@ def fit_old(composed: Composed, calibration: Calibration | None, unit: np.ndarra
         unit: Unit (N,) of each row.
     """
     point: Point = {} if calibration is None else {n: dict(v) for n, v in calibration.point.items()}
-    fitted = [e for e in point if not composed.effects[e].numeric]
+    names = () if calibration is None else calibration.names  # of laws that none lacks there are none
+    fitted = [e for e in dict.fromkeys(e for e, _ in names) if not composed.effects[e].numeric]
     runs = Runs(composed, point, unit)
     known = [composed.effects[e].parameters[s] for e in fitted for s in composed.effects[e].parameters]
     nominal, sd = np.array([q.nominal for q in known]), np.array([q.sd for q in known])

@@ -200,8 +200,8 @@ def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files
     found, log, _ = loaded(files)
     made = candidates(Setting(found.simulator, [log]))
     assert {n for n, e in made.items() if e.fitted} == found.simulator.numerics
-    steps = {"option.timestep", "option.integrator", "option.hold", "option.late", "option.iterations"}
-    assert found.simulator.numerics == steps
+    known = "timestep", "integrator", "iterations", "hold", "smooth", "late"
+    assert found.simulator.numerics == {f"option.{n}" for n in known}
     with pytest.raises(InputError, match="option has no integratr"):
         loaded(files, "option.integratr")
 
@@ -263,11 +263,11 @@ def test_a_patched_model_is_the_one_that_was_simulated(files, name):
         assert again.opt.timestep == pytest.approx(simulator.model.opt.timestep)
 
 
-def turning(files, described: str = TURN, more: str = ""):
+def turning(files, described: str = TURN, more: str = "", u: np.ndarray | None = None):
     """The servo's simulator and a log in which its command swings."""
     found = load_mjcf(*files(SERVO % more, described))
     t = np.arange(0, 2, 0.01)
-    log = Recording("a.csv", t, {"q": 0.3 * np.sin(6 * t), "u": 0.3 * np.sin(6 * t)})
+    log = Recording("a.csv", t, {"q": 0.3 * np.sin(6 * t), "u": 0.3 * np.sin(6 * t) if u is None else u})
     found.effects([log])
     nominal = {n: p.nominal for n, p in found.simulator.parameters.items()}
 
@@ -292,6 +292,16 @@ def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
         run(option__hold=1.0), np.interp(t, h * np.arange(len(asked)), asked), atol=1e-5
     )
     assert np.abs(run(option__hold=1.0, option__late=0.5) - run(option__hold=1.0)).max() > 1e-4
+
+
+def test_smoothed_commands_are_means_with_their_neighbours(files):
+    u = np.random.default_rng(0).uniform(-0.3, 0.3, 200)
+    mean = u.copy()
+    mean[1:-1] = 0.7 * u[1:-1] + 0.15 * (u[2:] + u[:-2])
+    _, plain = turning(files, u=mean)
+    _, run = turning(files, u=u)
+    np.testing.assert_allclose(run(option__smooth=0.3), plain(), atol=1e-12)
+    assert np.abs(run() - plain()).max() > 1e-3
 
 
 @pytest.mark.parametrize(("place", "at"), [("", 0.2), ('payload_at = {arm = "tool"}\n', 0.2),

@@ -22,6 +22,7 @@ from simgap.simulators.mjcf.setting import (
     FADE,
     HOLD,
     LATE,
+    SMOOTH,
     Setting,
     most_of,
     name_of,
@@ -209,6 +210,9 @@ class _Catalogue:
             # What comes half a sample later than in steps is a delay like any other, and reported as one.
             says = "commands between samples: in steps (0), in lines (1, half a sample sooner)"
             self.add(HOLD, 0.5, says, low=0.0, high=1.0)
+            # Without it lines would do for whatever smooths commands, and be half a sample sooner for it.
+            says = "commands smoothed by what carries them out: this share is from the neighbours' mean"
+            self.add(SMOOTH, 0.25, says, low=0.0, high=0.5)
             says = "commands come later within the simulator's step, by this share of it"
             self.add(LATE, 0.25, says, low=-0.5, high=0.5)
         if self.simulator.touching:

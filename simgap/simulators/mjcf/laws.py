@@ -88,42 +88,41 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
         Sensors (B, steps, sensors), as of `mujoco.rollout`.
     """
     out = np.empty((*control.shape[:2], model.nsensordata))
-    plain = np.array(model.dof_frictionloss)
-    usual = plain.tolist()
-    step, every, ctrl, sensed = mujoco.mj_step, model.dof_frictionloss, data.ctrl, data.sensordata
-    # A memoryview reads and writes plain numbers, several times as fast as an array.
-    seen = every, data.qvel, data.qfrc_actuator, data.qfrc_bias, data.actuator_force, data.qfrc_applied
-    views: list[Any] = [memoryview(each) for each in seen]
-    limit, rate, motor, bias, force, pushed = views
+    plain, nu, step = np.array(model.dof_frictionloss), model.nu, mujoco.mj_step
+    # Plain numbers and views of memory, several times as fast as elements and rows of arrays.
+    friction = [(f.dof, float(plain[f.dof]), 0.5 * f.share, *vars(f).values()) for f in laws.friction]
+    seen = model.dof_frictionloss, data.qvel, data.qfrc_actuator, data.qfrc_bias, data.actuator_force
+    views: list[Any] = [memoryview(one) for one in (*seen, data.qfrc_applied, data.ctrl, data.sensordata)]
+    limit, rate, motor, bias, force, pushed, ctrl, sensed = views
     applied = {*(f.dof for f in laws.friction if f.drag), *(dof for _, _, dof, _ in laws.fading)}
     try:
         for b in range(len(first)):
-            every[:] = plain
+            model.dof_frictionloss[:] = plain
             mujoco.mj_resetData(model, data)
             mujoco.mj_setState(model, data, first[b], FULL)
-            ctrl[:] = control[b, 0]
+            data.ctrl[:] = control[b, 0]
             mujoco.mj_forward(model, data)
             data.qacc_warmstart[:] = 0.0
-            for k in range(control.shape[1]):
+            given, told = memoryview(control[b].ravel()), []
+            for k in range(0, control[b].size, nu) if nu else range(control.shape[1]):
                 for dof in applied:
                     pushed[dof] = 0.0
-                for f in laws.friction:
-                    d, w = f.dof, rate[f.dof]
-                    most = usual[d]
-                    if f.share:
-                        most += 0.5 * f.share * abs(motor[d] + bias[d])
-                    if f.extra:
-                        most += f.extra * exp(-((w / f.speed) ** 2))
-                    if f.skew:
-                        most += f.skew * ((w > 0) - (w < 0))
+                for d, most, half, _, _, skew, extra, speed, drag in friction:
+                    if half:
+                        most += half * abs(motor[d] + bias[d])
+                    if extra:
+                        most += extra * exp(-((rate[d] / speed) ** 2))
+                    if skew:
+                        most += skew * ((rate[d] > 0) - (rate[d] < 0))
                     limit[d] = most if most > 0 else 0.0
-                    if f.drag:
-                        pushed[d] -= f.drag * w * abs(w)
+                    if drag:
+                        pushed[d] -= drag * rate[d] * abs(rate[d])
                 for a, by, dof, gear in laws.fading:
                     pushed[dof] -= by * abs(force[a]) * force[a] * gear
-                ctrl[:] = control[b, k]
+                ctrl[:] = given[k : k + nu]
                 step(model, data)
-                out[b, k] = sensed
+                told.append(sensed.tobytes())
+            out[b] = np.frombuffer(b"".join(told)).reshape(out[b].shape)
     finally:
-        every[:] = plain
+        model.dof_frictionloss[:] = plain
     return out

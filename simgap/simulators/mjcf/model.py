@@ -17,7 +17,7 @@ from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
-from simgap.simulators.mjcf.setting import HOLD, LATE, Setting, changed_model, object_id
+from simgap.simulators.mjcf.setting import HOLD, LATE, SMOOTH, Setting, changed_model, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
@@ -147,7 +147,7 @@ class MjcfSimulator:
     @property
     def numerics(self) -> frozenset[str]:
         """Parameters of the simulation rather than the robot."""
-        return self.dear | ({HOLD, LATE} & self.settings.keys())
+        return self.dear | ({HOLD, LATE, SMOOTH} & self.settings.keys())
 
     @property
     def dear(self) -> frozenset[str]:

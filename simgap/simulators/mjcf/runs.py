@@ -14,7 +14,7 @@ from simgap.latest import latest
 from simgap.simulators.mjcf.engine import rollout
 from simgap.simulators.mjcf.laws import Laws
 from simgap.simulators.mjcf.laws import run as run_with
-from simgap.simulators.mjcf.setting import HOLD, LATE
+from simgap.simulators.mjcf.setting import HOLD, LATE, SMOOTH
 from simgap.simulators.protocol import Channel, Channels
 from simgap.simulators.recording import Recording
 
@@ -161,12 +161,14 @@ class Runs:
         parts = [(mine, [logs[i] for i in mine]) for mine in alike.values()]
         sides = [self._side(own, times) for _, own in parts]
         control = np.zeros((len(logs), times.size, self.model.nu))
-        line, late = (dict(changed).get(name, 0.0) for name in (HOLD, LATE))
+        line, late, smooth = (dict(changed).get(name, 0.0) for name in (HOLD, LATE, SMOOTH))
         for (mine, own), (plain, _) in zip(parts, sides, strict=True):
             # A loop that sets a command and makes a step has the line where the step begins, not its mean.
             held = _carried_out(own, plain, (late + 0.5 * line) * h)
             for column, place in self.driven.items():
-                control[mine, :, place] = held(np.array([_commanded(log, column) for log in own]), line)
+                asked = np.array([_commanded(log, column) for log in own])
+                asked[:, 1:-1] += 0.5 * smooth * np.diff(asked, 2)
+                control[mine, :, place] = held(asked, line)
         sensed = self._sensed(first, control, changed)
         out: list[Channels | None] = [None] * len(logs)
         for (mine, own), side in zip(parts, sides, strict=True):

@@ -21,7 +21,9 @@ OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_
 FADE = "fade"  # a law of actuators
 # How commands are held between samples: 0 in steps; 1 in lines to the next, as they are where a step begins.
 HOLD = "option.hold"
+SMOOTH = "option.smooth"  # share of each command that is the mean of those before and after it
 LATE = "option.late"  # share of a step by which commands come later
+HELD = ("hold", "smooth", "late")
 
 
 @dataclass(frozen=True)
@@ -243,9 +245,7 @@ def _option(model: Any, _: str, attribute: str) -> Setting | None:
         "timestep": Setting(whole, "1", 0.0, err if exact else scale, mixed=1.0 if exact else -0.75),
         "integrator": Setting(whole, "1", 0.0, other, stored=False, mixed=1.0),
         "iterations": Setting(whole, "1", 0.0, more, stored=False, mixed=1.0),
-        "hold": Setting(whole, "1", 0.0, nothing, stored=False),
-        "late": Setting(whole, "1", 0.0, nothing, stored=False),
-    }
+    } | dict.fromkeys(HELD, Setting(whole, "1", 0.0, nothing, stored=False))
     return made.get(attribute)
 
 
@@ -270,7 +270,7 @@ KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...
     "geom": (_geom, ("friction", "torsional", "time_constant", "damping_ratio", "dmin", "size")),
     "actuator": (_actuator, ("gain", "damping", "limit", FADE)),
     "drive": (_drive, ("gravity_compensation",)),
-    "option": (_option, ("tilt_x", "tilt_y", "timestep", "integrator", "iterations", "hold", "late")),
+    "option": (_option, ("tilt_x", "tilt_y", "timestep", "integrator", "iterations", *HELD)),
 }
 
 
