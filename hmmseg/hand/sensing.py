@@ -287,33 +287,37 @@ def _range(values: np.ndarray) -> float:
 def _remove_leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
     """A single position that steps as its velocity does not; the samples in doubt are set to NaN.
 
-    If several positions step, the hand does (backlash).
+    If several positions step, the hand does (backlash). A clock that errs moves all positions at once, each
+    by its velocity, so that the others tell by how much.
     """
+    periods, usual = np.diff(t), float(np.median(np.diff(t)))
+    pairs = {q: v for q, v in rates.items() if np.isfinite(channels[q] + channels[v]).sum() >= MIN_ALIVE}
+    speeds = np.array([(channels[v][1:] + channels[v][:-1]) / 2 for v in pairs.values()])
+    excess = np.array([np.diff(channels[q]) for q in pairs]) - periods * speeds
+    excess[:, ~(periods < 1.5 * usual)] = np.nan  # velocities do not bridge a gap
+    late, moving = np.nan_to_num(speeds * excess), np.nan_to_num(speeds**2)
     stepping = {}
-    for name, rate in rates.items():
-        there = np.flatnonzero(np.isfinite(channels[name]) & np.isfinite(channels[rate]))
-        if there.size < MIN_ALIVE:
-            continue
-        q, v, times = channels[name][there], channels[rate][there], t[there]
-        excess = np.diff(q) - np.diff(times) * (v[1:] + v[:-1]) / 2
-        fastest = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(v), 2, mode="edge"), 6).max(axis=1)
-        covered = fastest * np.diff(times)
-        far = np.abs(excess) > np.maximum(LEAP * robust_sd(excess), FASTEST * covered)
-        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # velocities do not bridge a gap
+    for k, (name, rate) in enumerate(pairs.items()):
+        noise = robust_sd(excess[k][np.isfinite(excess[k])])
+        padded = np.pad(np.nan_to_num(np.abs(channels[rate])), 2, mode="edge")
+        fastest = np.lib.stride_tricks.sliding_window_view(padded, 6).max(axis=1)
+        error = (late.sum(0) - late[k]) / (moving.sum(0) - moving[k] + (noise / usual) ** 2)
+        least = np.fmin(np.abs(excess[k]), np.abs(excess[k] - speeds[k] * error))
+        far = least > np.maximum(LEAP * noise, FASTEST * fastest * periods)
         if far.any():
-            stepping[name] = there, np.where(far, excess, 0.0)
+            stepping[name] = np.where(far, excess[k], 0.0)
     if len(stepping) != 1:
         return []
-    name, (there, steps) = next(iter(stepping.items()))
+    name, steps = next(iter(stepping.items()))
     at, offset = np.flatnonzero(steps), np.r_[0.0, np.cumsum(steps)]
     if at.size > STEPS:
         return []
-    away = np.abs(offset) > np.abs(steps[at]).min() / 2
-    problem = f"jumps by {steps[at[0]]:.3g} at {t[there[at[0] + 1]]:.2f} s, as its velocity does not"
-    if away[-1]:  # it never comes back: either side may be wrong
+    away = np.flatnonzero(np.abs(offset) > np.abs(steps[at]).min() / 2)
+    problem = f"jumps by {steps[at[0]]:.3g} at {t[at[0] + 1]:.2f} s, as its velocity does not"
+    if away[-1] == t.size - 1:  # it never comes back: either side may be wrong
         first, last, why = 0, t.size - 1, ": which side is right nothing tells, so it is left out"
     else:
-        first, last, why = there[away][0], there[away][-1], ", and is left out"
+        first, last, why = away[0], away[-1], ", and is left out"
     channels[name][first : last + 1] = np.nan
     return [Fault(name, problem + why, ((float(t[first]), float(t[last])),))]
 
