@@ -291,26 +291,26 @@ def _remove_leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[st
     by its velocity, so that the others tell by how much.
     """
     periods, usual = np.diff(t), float(np.median(np.diff(t)))
-    pairs = {q: v for q, v in rates.items() if np.isfinite(channels[q] + channels[v]).sum() >= MIN_ALIVE}
-    speeds = np.array([(channels[v][1:] + channels[v][:-1]) / 2 for v in pairs.values()])
-    excess = np.array([np.diff(channels[q]) for q in pairs]) - periods * speeds
-    excess[:, ~(periods < 1.5 * usual)] = np.nan  # velocities do not bridge a gap
-    late, moving = np.nan_to_num(speeds * excess), np.nan_to_num(speeds**2)
-    stepping = {}
-    for k, (name, rate) in enumerate(pairs.items()):
-        noise = robust_sd(excess[k][np.isfinite(excess[k])])
-        padded = np.pad(np.nan_to_num(np.abs(channels[rate])), 2, mode="edge")
-        fastest = np.lib.stride_tricks.sliding_window_view(padded, 6).max(axis=1)
-        error = (late.sum(0) - late[k]) / (moving.sum(0) - moving[k] + (noise / usual) ** 2)
-        least = np.fmin(np.abs(excess[k]), np.abs(excess[k] - speeds[k] * error))
-        far = least > np.maximum(LEAP * noise, FASTEST * fastest * periods)
-        if far.any():
-            stepping[name] = np.where(far, excess[k], 0.0)
-    if len(stepping) != 1:
+    near = periods < 1.5 * usual  # velocities do not bridge a gap
+    alive = {n: of for n, of in rates.items()
+             if np.isfinite(np.diff(channels[n] + channels[of])[near]).sum() >= MIN_ALIVE}  # fmt: skip
+    q, v = (np.array([channels[n] for n in names]).reshape(-1, t.size) for names in (alive, alive.values()))
+    speeds = (v[:, 1:] + v[:, :-1]) / 2
+    excess = np.where(near, np.diff(q) - periods * speeds, np.nan)
+    noise = np.array([robust_sd(e[np.isfinite(e)]) for e in excess])[:, None]
+    padded = np.pad(np.nan_to_num(np.abs(v)), ((0, 0), (2, 2)), mode="edge")
+    fastest = np.lib.stride_tricks.sliding_window_view(padded, 6, axis=1).max(axis=2)
+    least = np.maximum(LEAP * noise, FASTEST * fastest * periods)
+    stepping = np.flatnonzero((np.abs(excess) > least).any(axis=1))
+    if stepping.size != 1:
         return []
-    name, steps = next(iter(stepping.items()))
+    k, name = stepping[0], list(alive)[stepping[0]]
+    seen = np.nan_to_num(np.delete([speeds * excess, speeds**2], k, axis=1)).sum(axis=1)
+    error = seen[0] / (seen[1] + (noise[k] / usual) ** 2)
+    far = np.fmin(np.abs(excess[k]), np.abs(excess[k] - speeds[k] * error)) > least[k]
+    steps = np.where(far, excess[k], 0.0)
     at, offset = np.flatnonzero(steps), np.r_[0.0, np.cumsum(steps)]
-    if at.size > STEPS:
+    if not 0 < at.size <= STEPS:
         return []
     away = np.flatnonzero(np.abs(offset) > np.abs(steps[at]).min() / 2)
     problem = f"jumps by {steps[at[0]]:.3g} at {t[at[0] + 1]:.2f} s, as its velocity does not"
