@@ -168,6 +168,7 @@ def calibrate(
         with show_stages(out, "calibrating", STAGES) as tell:
             found = fit(robot, recordings, effects, length=length, tell=tell)
         warn_of_engine(out, own)
+        out.warn(*found.warnings)
         document = found.body()
         reasons = (f"{name}: {reason}" for name, reason in document["reasons"].items())
         out.print(*_calibration_tables(document), *reasons)

@@ -32,7 +32,7 @@ STAGES = 4  # look: stages that a progress bar counts
 LONGEST = 20.0  # numerics: s that a log is run freely at most
 STEPS, AGAIN = 30, 4  # numerics: steps of a fit, and of one that begins where another ended
 ROUNDS = 2  # numerics: fits, each in units of the residual of the last one
-LEAVES = 4.0  # numerics: squares over the noise's, from which laws that a model lacks are fitted too
+LEAVES = 4.0  # numerics: squares over the noise's, from which what a model lacks is fitted, and told
 UNTOLD = 0.5  # chosen: share of the prior's sd; a parameter with more left is not determined by the logs
 NOTHING = 0.05  # numerics: a correlation up to which there is none
 COUPLED = 0.05  # numerics: weight in an undetermined direction from which a parameter belongs to it
@@ -45,7 +45,7 @@ class Calibration:
     `composed`: the model along whole logs; `point`: the best fit; `names`: effect and parameter, in the order
     of what follows; `sd`: the priors' standard deviations (p,); `covariance`: of the fit (p, p);
     `information`: of the logs (p, p), in units of `sd`; `before`, `after`: root mean squares by channel of
-    free runs along held-out logs, nominal and fitted.
+    free runs along held-out logs, nominal and fitted; `left`: of the fit's residuals over their noise.
     """
 
     composed: Composed
@@ -56,6 +56,7 @@ class Calibration:
     information: np.ndarray
     before: Mapping[str, float]
     after: Mapping[str, float]
+    left: Mapping[str, float]
 
     @property
     def determined(self) -> np.ndarray:
@@ -80,6 +81,13 @@ class Calibration:
             "numerics": {self.label(k): self.entry(k) for k in every if k not in own},
             "heldout": {"before": dict(self.before), "after": dict(self.after)},
         }
+
+    @property
+    def warnings(self) -> list[str]:
+        """A line for each channel of which more than the noise is left."""
+        return [f"{name}: {times:.2g} times its noise is left, which no fitted parameter explains; one that "
+                "stands in for it is off by more than its interval says (hmmseg diagnose looks for the cause)"
+                for name, times in self.left.items() if times > np.sqrt(LEAVES)]  # fmt: skip
 
     def label(self, k: int) -> str:
         """A parameter's name in the document."""
@@ -210,7 +218,9 @@ def calibrate(
     names, sd, information, covariance = _sensitivities(whole.moved(found), found, linear, whiten, stated)
     tell("held-out logs")
     before, after = _held_out(whole.moved(found), found, stated) if judged else ({}, {})
-    return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
+    noiseless = without_starts(whole, linear, np.sqrt(linear.rows.variance))
+    left = linear.rows.rms(noiseless(np.nan_to_num(linear.residual)))
+    return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after, left)
 
 
 def _stretches(recordings: Sequence[Recording]) -> list[Recording]:
