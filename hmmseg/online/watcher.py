@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hand.plausibility import check_angles, check_lengths, judge
 from hmmseg.hand.signals import level_row
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
-from hmmseg.io.trial import ROLL
+from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import GAP
 from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
@@ -22,6 +23,7 @@ from hmmseg.online.wrist import Wrist, checked
 LAG = 1.0  # chosen: s; default lag: contacts ring for a fifth of that
 SNAPSHOTS = 10  # numerics: points per lag to which a late row can return
 USUAL = 0.02  # numerics: update rate of the usual interval
+JUDGED = 50  # numerics: rows between two looks at whether the readings are a hand's
 ODD = {
     "repeated": "repeated: the row at {t:.9g} s came before, and counts once",
     "contradictory": "contradictory: another row at {t:.9g} s came before; the first one counts",
@@ -61,6 +63,7 @@ class Watcher:
         self.counts: Counter[str] = Counter()
         self._mark: Any = None  # snapshot of the start of a wrist gripper's last grip
         self._snapshots: deque[tuple[float, Any]] = deque(maxlen=SNAPSHOTS + 1)
+        self._ends = np.full((3, 1), np.nan)  # last row, and what two neighbours did not fall below, exceed
         self._roll = 0.0  # last recorded roll of the hand [rad]
         self._every = max(float(lag), 0.1) / SNAPSHOTS
         self._usual = 1.0 / hand.rate if hand.rate else math.nan
@@ -92,7 +95,7 @@ class Watcher:
 
         Raises:
             ValueError: for another number of channels, or a time that is not finite.
-            InputError: for an impossible orientation, or lifts that pull up.
+            InputError: for an impossible orientation, positions or angles, or lifts that pull up.
         """
         if isinstance(channels, Mapping):
             channels = [channels.get(name, math.nan) for name in self.channels]
@@ -106,6 +109,7 @@ class Watcher:
         if not math.isfinite(t):
             raise ValueError(f"t: {t}, expected a time in s")
         self.counts["rows"] += 1
+        self._check_units(row)
         note = self._take(t, row) if self._wrist is None else self._take_wrist(self._wrist, t, row)
         answer = self.filter.answer()
         answer.note = note
@@ -116,6 +120,16 @@ class Watcher:
         if not math.isnan(row[-1]):
             self._roll = float(row[-1])
         return level_row(row[:-1], self._roll) if self._roll else row[:-1]
+
+    def _check_units(self, row: np.ndarray) -> None:
+        """InputError once two neighbouring rows show what no hand does, such as millimetres taken for m."""
+        last, low, high = self._ends
+        low, high = np.fmin(low, np.maximum(row, last)), np.fmax(high, np.minimum(row, last))
+        self._ends = np.array([row, low, high])
+        if self.counts["rows"] % JUDGED == 0:
+            ends = zip(self.channels, self._ends[1:].T, strict=False)
+            trial = Trial("stream", np.array([0.0, 1.0]), dict(ends))
+            judge(trial, [*check_lengths(trial, self.filter.rig), *check_angles(trial, self.filter.rig)])
 
     def _take(self, t: float, row: np.ndarray) -> str | None:
         """Process a row; returns its irregularity."""

@@ -62,6 +62,16 @@ def test_bad_input_gets_one_line(run, change, message):
     assert len(err.splitlines()) == 1 and message in err
 
 
+def test_angles_in_degrees_are_refused_as_in_a_file(run):
+    cells = [row.split(",") for row in ROWS[1:110]]
+    angles = [k for k, name in enumerate(ROWS[0].split(",")) if name[0] in "qd"]
+    rows = [",".join(str(57.3 * float(c)) if k in angles else c for k, c in enumerate(row)) for row in cells]
+    code, _, err = run([ROWS[0], *rows])
+    assert code == 2 and "it looks like deg; expected q11 = {" in err
+    wild = [*ROWS[:50], ",".join([ROWS[50].split(",")[0], *["999"] * 12]), *ROWS[51:110]]
+    assert run(wild)[0] == 0  # a single row is no unit
+
+
 def test_a_stream_as_a_spreadsheet_has_it(run):
     """Semicolons, decimal commas, remarks, a row of units and ISO stamps: the answers of the plain stream."""
     plain = run(ROWS[:60])[1]
