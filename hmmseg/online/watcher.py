@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.plausibility import check_angles, check_lengths, judge
+from hmmseg.hand.plausibility import check_angles, check_lengths
 from hmmseg.hand.signals import level_row
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
@@ -23,7 +23,7 @@ from hmmseg.online.wrist import Wrist, checked
 LAG = 1.0  # chosen: s; default lag: contacts ring for a fifth of that
 SNAPSHOTS = 10  # numerics: points per lag to which a late row can return
 USUAL = 0.02  # numerics: update rate of the usual interval
-JUDGED = 50  # numerics: rows between two looks at whether the readings are a hand's
+JUDGED = 20  # numerics: rows of which one is looked at for readings that no hand has
 ODD = {
     "repeated": "repeated: the row at {t:.9g} s came before, and counts once",
     "contradictory": "contradictory: another row at {t:.9g} s came before; the first one counts",
@@ -63,7 +63,8 @@ class Watcher:
         self.counts: Counter[str] = Counter()
         self._mark: Any = None  # snapshot of the start of a wrist gripper's last grip
         self._snapshots: deque[tuple[float, Any]] = deque(maxlen=SNAPSHOTS + 1)
-        self._ends = np.full((3, 1), np.nan)  # last row, and what two neighbours did not fall below, exceed
+        self._looked: deque[np.ndarray] = deque(maxlen=3)
+        self._ends = np.full((2, 1), np.nan)  # least and greatest of the middle ones
         self._roll = 0.0  # last recorded roll of the hand [rad]
         self._every = max(float(lag), 0.1) / SNAPSHOTS
         self._usual = 1.0 / hand.rate if hand.rate else math.nan
@@ -109,7 +110,8 @@ class Watcher:
         if not math.isfinite(t):
             raise ValueError(f"t: {t}, expected a time in s")
         self.counts["rows"] += 1
-        self._check_units(row)
+        if self.counts["rows"] % JUDGED == 0:
+            self._check_units(row)
         note = self._take(t, row) if self._wrist is None else self._take_wrist(self._wrist, t, row)
         answer = self.filter.answer()
         answer.note = note
@@ -122,14 +124,16 @@ class Watcher:
         return level_row(row[:-1], self._roll) if self._roll else row[:-1]
 
     def _check_units(self, row: np.ndarray) -> None:
-        """InputError once two neighbouring rows show what no hand does, such as millimetres taken for m."""
-        last, low, high = self._ends
-        low, high = np.fmin(low, np.maximum(row, last)), np.fmax(high, np.minimum(row, last))
-        self._ends = np.array([row, low, high])
-        if self.counts["rows"] % JUDGED == 0:
-            ends = zip(self.channels, self._ends[1:].T, strict=False)
-            trial = Trial("stream", np.array([0.0, 1.0]), dict(ends))
-            judge(trial, [*check_lengths(trial, self.filter.rig), *check_angles(trial, self.filter.rig)])
+        """InputError once readings show what no hand does, such as millimetres taken for m."""
+        self._looked.append(row)
+        middle = np.sort(self._looked, axis=0)[len(self._looked) // 2]  # of three: one may be wild
+        self._ends = np.array([np.fmin(self._ends[0], middle), np.fmax(self._ends[1], middle)])
+        ends = dict(zip(self.channels, self._ends.T, strict=False))
+        trial, rig = Trial("stream", np.array([0.0, 1.0]), ends), self.filter.rig
+        for found in (*check_lengths(trial, rig), *check_angles(trial, rig)):
+            if found.certain:  # which other columns are in this unit may not show yet
+                remedy = f'{found.channel} = {{unit = "..."}} and the like under [columns] in rig.toml'
+                raise InputError(f"stream: column {found.channel}", found.problem, remedy)
 
     def _take(self, t: float, row: np.ndarray) -> str | None:
         """Process a row; returns its irregularity."""

@@ -90,7 +90,7 @@ def test_emissions_are_those_off_line():
             aside, upward = one._halting(h, x, span)
             more = aside + upward
             np.testing.assert_allclose(more, halting[n], rtol=1e-6, atol=1e-6)
-            if step.state == FREE:  # how often a hand halts differs: the filter must not take a rest for a halt
+            if step.state == FREE:  # how often a hand halts differs: a rest must not pass for a halt
                 found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
             if step.state == ABOVE_GROUND:
                 found -= np.log(1 - 2 * halt + halt * np.exp(upward) * (1 + np.exp(aside)))
