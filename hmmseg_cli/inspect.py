@@ -88,10 +88,11 @@ def _show(out: Output, found: Inspection) -> None:
     ]  # fmt: skip
     out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
     out.warn(*found.remarks)
-    segment = f"hmmseg segment {found.file} --task task.toml"
+    file = shlex.quote(found.file)
+    segment = f"hmmseg segment {file} --task task.toml"
     if found.toml:
         out.print("proposed for rig.toml:")
-        text = f"{found.toml}\nnext: hmmseg inspect {found.file} --write rig.toml, or copy it there"
+        text = f"{found.toml}\nnext: hmmseg inspect {file} --write rig.toml, or copy it there"
     elif not found.understood:
         text = (f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
                 "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"

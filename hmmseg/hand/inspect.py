@@ -140,7 +140,7 @@ def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
         return Channel(name, unit, None, len(table.columns[name]), 0, 0, None, None, (), text=True)
     there = values[np.isfinite(values)]
     rate = table.rates.get(name)
-    if rate is None and t is not None:
+    if rate is None and t is not None and there.size:
         rate = float((there.size - 1) / (t[-1] - t[0]))
     low, high = (float(there.min()), float(there.max())) if there.size else (None, None)
     pieces = [p[np.isfinite(p)] for p in np.array_split(values, min(BUCKETS, max(values.size, 1)))]

@@ -81,11 +81,13 @@ def test_what_is_in_a_file(tmp_path):
     t = np.delete(np.arange(100) * 0.02, [40, 41, 42, 43, 44])
     force = np.sin(t)
     force[3] = np.nan
-    pd.DataFrame({"t": t, "force [N]": force, "note": "x"}).to_csv(tmp_path / "a.csv", index=False)
+    table = pd.DataFrame({"t": t, "force [N]": force, "note": "x", "left": np.nan})
+    table.to_csv(tmp_path / "a.csv", index=False)
     found = inspect(tmp_path / "a.csv")
     assert (found.samples, found.rate, found.end) == (95, pytest.approx(50.0), pytest.approx(1.98))
     assert found.gaps == ((pytest.approx(0.78), pytest.approx(0.9)),)
-    _, channel, note = found.channels
+    _, channel, note, left = found.channels
+    assert left.rate is None and left.missing == 95
     assert (channel.unit, channel.missing, note.text, found.mapping) == ("N", 1, True, {})
     assert channel.maximum == pytest.approx(np.nanmax(force))
 
