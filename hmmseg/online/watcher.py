@@ -53,7 +53,7 @@ class Watcher:
             raise InputError("task", "a plain ordered task cannot be watched", "objects and moves")
         if not 0 <= lag < math.inf:
             raise InputError("lag", f"found {lag}", "0 s or more")
-        self.filter = Filter(description, hand, float(lag))
+        self.lag, self.filter = float(lag), Filter(description, hand, float(lag))
         self._wrist = None if hand.gripper is None else Wrist(hand)
         self.channels, self.optional = self.filter.channels, self.filter.optional
         if not hand.jointed and self._wrist is None:
@@ -77,11 +77,6 @@ class Watcher:
             return math.nan, math.nan
         fx1, fy1, fx2, fy2 = rows[-1][1][[4, 5, 10, 11]]
         return float(fx1 - fx2) / 2, float(fy1 + fy2)
-
-    @property
-    def lag(self) -> float:
-        """Delay after which a boundary is settled [s]."""
-        return self.filter.lag
 
     def update(self, t: float, channels: Sequence[float] | Mapping[str, float] | np.ndarray) -> Answer:
         """Process one row.

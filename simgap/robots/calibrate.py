@@ -82,13 +82,6 @@ class Calibration:
             "heldout": {"before": dict(self.before), "after": dict(self.after)},
         }
 
-    @property
-    def warnings(self) -> list[str]:
-        """A line for each channel of which more than the noise is left."""
-        return [f"{name}: {times:.2g} times its noise is left, which no fitted parameter explains; one that "
-                "stands in for it is off by more than its interval says (hmmseg diagnose looks for the cause)"
-                for name, times in self.left.items() if times > np.sqrt(LEAVES)]  # fmt: skip
-
     def label(self, k: int) -> str:
         """A parameter's name in the document."""
         effect, short = self.names[k]

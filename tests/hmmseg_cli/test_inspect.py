@@ -251,7 +251,7 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
         "elbow_deg": ("joint", "position"), "elbow_vel": ("joint", "velocity"),
         "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force"),
     }  # fmt: skip
-    assert (found.time, found.time_factor) == ("ros_stamp", 1e-9)
+    assert (found.clock.column, found.clock.size) == ("ros_stamp", 1e-9)
     assert main(["new", str(tmp_path / "other"), "--mjcf", str(tmp_path / "robot.xml")]) == 2
 
 

@@ -138,7 +138,6 @@ class Map(StrictTable):
     uncertain: tuple[Name, ...] = ()
     sd: dict[Name, FinitePositive] = Field(default_factory=dict)
     payload_at: dict[Name, Place] = Field(default_factory=dict)
-    _file: str = ""
 
     @field_validator("columns")
     @classmethod
@@ -147,27 +146,10 @@ class Map(StrictTable):
             raise ValueError("are all commands: nothing to compare; expected a joint, sensor or body")
         return columns
 
-    @property
-    def file(self) -> str:
-        """The file that it was read from."""
-        return self._file
-
-    @property
-    def time(self) -> str:
-        """The name of the time column."""
-        return self.clock.column
-
-    @property
-    def time_factor(self) -> float:
-        """Its unit [s]."""
-        return self.clock.size
-
 
 def read_map(path: Path) -> Map:
     """Read a map from a TOML file; InputError names the key at fault."""
-    found = validated(Map, read_toml(path), str(path))
-    found._file = str(path)
-    return found
+    return validated(Map, read_toml(path), str(path))
 
 
 SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}
@@ -180,16 +162,10 @@ def proposed_map(
 ) -> tuple[str, list[str]]:
     """Propose a map for a model and the columns of a log.
 
-    A column is the joint, actuator or sensor with the longest name that it contains: a joint's velocity where
-    it speaks of speed; where it speaks of a command or a torque an actuator, by its own or its joint's name.
-
-    Args:
-        xml: The model.
-        columns: Name and unit of each column.
-        clock: Which column counts the time (`from`), and its `unit`, where that is not t in s.
-
-    Returns:
-        The map's text, and the columns that no name decides.
+    A column (name, unit) is the joint, actuator or sensor with the longest name that it contains: a joint's
+    velocity where it speaks of speed; where it speaks of a command or a torque an actuator, by its own or its
+    joint's name. `clock`: which column counts the time (`from`), and its `unit`, where that is not t in s.
+    Returns the map's text, and the columns that no name decides; InputError for a model that cannot be read.
     """
     from simgap.simulators.mjcf.engine import mujoco
     from simgap.simulators.mjcf.setting import names_of
