@@ -168,7 +168,7 @@ def calibrate(
         with show_stages(out, "calibrating", STAGES) as tell:
             found = fit(robot, recordings, effects, length=length, tell=tell)
         warn_of_engine(out, own)
-        out.warn(*(f"{name}: {times:.2g} times its noise is left, which no parameter fitted explains; one that "
+        out.warn(*(f"{name}: {times:.2g} times its noise is left, which nothing fitted explains; one that "
                    "stands in for it is off by more than its interval says (hmmseg diagnose seeks it)"
                    for name, times in found.left.items() if times > LEAVES**0.5))  # fmt: skip
         document = found.body()
