@@ -281,8 +281,7 @@ def _log_known(value, factor, known, q, others, variance, share, span, rising):
 
 @compiled
 def _halting(h, x, span):
-    """Log density ratios of a hand that halts to one that moves: of its velocity aside, and of its vertical
-    velocity and height."""
+    """Log density ratios of a hand that halts to one that moves: of motion aside, and of vertical motion."""
     aside = upward = 0.0
     moving = _square(h, VELOCITY)
     if not math.isnan(x.vx):
