@@ -9,8 +9,6 @@ carried force, the pads' give along the grip, their shear deflection.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 
 PROPERTY_MEDIAN = {"weight": 0.5, "width": 0.02, "height": 0.02}  # prior: N, m, m
@@ -19,13 +17,6 @@ PROPERTY_LOG_SD = {"weight": 1.5, "width": 1.0, "height": 1.0}  # prior: a facto
 SCATTER_MEDIAN = np.array([1e-3, 1e-3, 0.02])  # prior: median share that differs between grips, by channel
 SCATTER_LOG_SD = 1.0  # prior: of log(share / its median), normal: heavier tails would have no sd
 COMMON = np.array([5e-4, 1e-3, 0.03])  # prior: sd of the share common to all grips, by channel
-
-
-def property_priors(names: Iterable[tuple[str, str]]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (num_properties,) of the log properties."""
-    props = [prop for _, prop in names]
-    mean = np.log([PROPERTY_MEDIAN[prop] for prop in props])
-    return mean, np.array([PROPERTY_LOG_SD[prop] for prop in props])
 
 
 def log_prior(prop: str, coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -70,7 +70,8 @@ def _unread(trial: Any, rig: Any, size: float) -> Any:
 def drawn(design: Design, rng: np.random.Generator) -> tuple[Design, np.ndarray]:
     """The design with data drawn from the model, and the true properties (Q,)."""
     d = design
-    mean, sd = priors.property_priors([(u.name[0], u.prop) for u in d.unknowns])
+    mean = np.log([priors.PROPERTY_MEDIAN[u.prop] for u in d.unknowns])
+    sd = np.array([priors.PROPERTY_LOG_SD[u.prop] for u in d.unknowns])
     true = np.exp(mean + sd * rng.normal(size=mean.size))
     log_s = rng.normal(size=3) / np.sqrt(2 * d.scale_count)
     share = priors.SCATTER_MEDIAN * np.exp(priors.SCATTER_LOG_SD * rng.normal(size=3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -87,10 +88,11 @@ def _show(out: Output, found: Inspection) -> None:
     ]  # fmt: skip
     out.print(listed(head, heads, rows, right=heads[2:6], wraps=True))
     out.warn(*found.remarks)
-    segment = f"hmmseg segment {found.file} --task task.toml"
+    file = shlex.quote(found.file)
+    segment = f"hmmseg segment {file} --task task.toml"
     if found.toml:
         out.print("proposed for rig.toml:")
-        text = f"{found.toml}\nnext: hmmseg inspect {found.file} --write rig.toml, or copy it there"
+        text = f"{found.toml}\nnext: hmmseg inspect {file} --write rig.toml, or copy it there"
     elif not found.understood:
         text = (f"{found.file}: no name was recognised as a hand's; [columns] in rig.toml says which is "
                 "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"
@@ -159,8 +161,8 @@ def new(
             read(staged)
         then = "hmmseg inspect FILE looks into a recording"
         if looked is not None:
-            then = ("say in task.toml what goes where, then: "
-                    f"hmmseg segment {source} --task {targets[1]} --rig {targets[0]}")  # fmt: skip
+            files = shlex.join([str(source), "--task", str(targets[1]), "--rig", str(targets[0])])
+            then = f"say in task.toml what goes where, then: hmmseg segment {files}"
         out.print(f"wrote {targets[0]} and {targets[1]}; {then}")
         out.finish({"files": [str(path) for path in targets], "hand": hand.value})
 
@@ -180,8 +182,10 @@ def _lay_out_map(out: Output, path: Path, mjcf: Path, source: Path, looked: Insp
     """Write a map.toml that matches columns of a log with parts of the model by name."""
     from simgap.simulators.mjcf.map import proposed_map
 
-    text, open_columns = proposed_map(mjcf, [(c.name, c.unit) for c in looked.channels if not c.text])
+    columns = [(c.name, c.unit) for c in looked.channels if not c.text]
+    text, open_columns = proposed_map(mjcf, columns, looked.mapping.get("t", {}))
     out.stage(path).write_text(text, encoding="utf-8")
     left = f"; columns left to you: {', '.join(open_columns)}" if open_columns else ""
     out.print(f"wrote {path}{left}")
-    out.print(f"then: hmmseg diagnose {source} --mjcf {mjcf} --map {path} --report gap.html")
+    files = shlex.join([str(source), "--mjcf", str(mjcf), "--map", str(path)])
+    out.print(f"then: hmmseg diagnose {files} --report gap.html")

@@ -159,7 +159,7 @@ def calibrate(
         if not own.given:
             raise InputError("--model", "missing", "--model XML --map MAP.toml, or --simulator FILE.py:NAME")
         own.check_alone({})
-        from simgap.robots.calibrate import STAGES
+        from simgap.robots.calibrate import LEAVES, STAGES
         from simgap.robots.calibrate import calibrate as fit
 
         robot, recordings, loaded = read_logs(out, distinct_trials(logs), own)
@@ -168,6 +168,9 @@ def calibrate(
         with show_stages(out, "calibrating", STAGES) as tell:
             found = fit(robot, recordings, effects, length=length, tell=tell)
         warn_of_engine(out, own)
+        out.warn(*(f"{name}: {times:.2g} times its noise is left, which nothing fitted explains; one that "
+                   "stands in for it is off by more than its interval says (hmmseg diagnose seeks it)"
+                   for name, times in found.left.items() if times > LEAVES**0.5))  # fmt: skip
         document = found.body()
         reasons = (f"{name}: {reason}" for name, reason in document["reasons"].items())
         out.print(*_calibration_tables(document), *reasons)
@@ -298,7 +301,7 @@ def _deliver(
         while any(log.name == name for log in logs):  # the motion that was asked for last time
             name = f"next_{name}"
         place = folder / name
-        time = ("t", 1.0) if loaded is None else (loaded.map.time, loaded.map.time_factor)
+        time = ("t", 1.0) if loaded is None else (loaded.map.clock.column, loaded.map.clock.size)
         commands = [n for n, c in found.composed.simulator.channels.items() if c.kind == "command"]
         text = robot.motion_csv(motion, commands, units, time)
         out.stage(place).write_text(text, encoding="utf-8")

@@ -58,10 +58,10 @@ def watch(
             if show is not None:
                 show.close()
         final = watcher.finish()
-        out.warn(*rows.notes)
-        for key, text in COUNTED.items():
-            if watcher.counts[key]:
-                out.warn(f"{watcher.counts[key]} {text}")
+        if "fingertip" not in watcher.filter.rig.model_fields_set:
+            out.warn("the rig states no [fingertip]: heights and widths are off by what the pads give")
+        counts = {key: count for key in COUNTED if (count := watcher.counts[key])}
+        out.warn(*rows.notes, *(f"{count} {COUNTED[key]}" for key, count in counts.items()))
         envelope = {"format": "hmmseg.watch/1", "version": hmmseg.__version__, "seed": seed,
                     "warnings": out.warnings, "figures": [], "counts": dict(watcher.counts)}  # fmt: skip
         line = final.line(envelope)

@@ -13,7 +13,7 @@ from estimation import identify
 from estimation.identification import Identification, source_subtasks
 from estimation.observations import draw_boundaries
 from estimation.paper_formulas import estimate_plugin
-from estimation.priors import property_priors
+from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
 from experiments.paper.sources import BLOCKS, ONE, PRINTED, qualitative, recorded, save, simulated
 from experiments.recordings import Case
 from hmmseg.contact.decompose import decompose
@@ -87,7 +87,8 @@ def by_posterior(found: Identification) -> dict:
 def posterior(found: Identification) -> dict:
     """Draws for a corner plot, with the priors of the log properties."""
     chosen = np.linspace(0, len(found.draws) - 1, DRAWS).astype(int)
-    mean, sd = property_priors(found.names)
+    mean = np.log([PROPERTY_MEDIAN[prop] for _, prop in found.names])
+    sd = np.array([PROPERTY_LOG_SD[prop] for _, prop in found.names])
     return {"names": [list(name) for name in found.names], "draws": found.draws[chosen],
             "prior_log_mean": mean, "prior_log_sd": sd}  # fmt: skip
 

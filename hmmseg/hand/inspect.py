@@ -140,7 +140,7 @@ def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
         return Channel(name, unit, None, len(table.columns[name]), 0, 0, None, None, (), text=True)
     there = values[np.isfinite(values)]
     rate = table.rates.get(name)
-    if rate is None and t is not None:
+    if rate is None and t is not None and there.size:
         rate = float((there.size - 1) / (t[-1] - t[0]))
     low, high = (float(there.min()), float(there.max())) if there.size else (None, None)
     pieces = [p[np.isfinite(p)] for p in np.array_split(values, min(BUCKETS, max(values.size, 1)))]
@@ -149,7 +149,7 @@ def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:
 
 
 TIME = ("t", "time", "timestamp", "stamp", "timestamps", "sec", "seconds", "clock", "times", "zeit",
-        "zeitstempel")  # fmt: skip
+        "zeitstempel", "elapsed")  # fmt: skip
 LEFT = {"left", "l", "lf", "finger1", "f1", "thumb", "1", "lh", "links", "linker"}
 RIGHT = {"right", "r", "rf", "finger2", "f2", "index", "2", "rh", "rechts", "rechter"}
 QUANTITIES = {
@@ -226,10 +226,11 @@ def as_toml(entries: Mapping[str, Mapping[str, Any]], table: Table) -> str:
 def _time_column(names: Sequence[str]) -> dict[str, str]:
     if "t" in names:
         return {}
-    for wanted in TIME:
-        for name in names:
-            if re.sub(r"[\[(].*", "", name).strip().lower() == wanted or words(name)[:1] == [wanted]:
-                return {"t": name}
+    for first in (True, False):  # t counts only as the first word of a name
+        for wanted in TIME[not first :]:
+            for name in names:
+                if wanted in words(name)[: 1 if first else None]:
+                    return {"t": name}
     return {}
 
 

@@ -20,7 +20,7 @@ from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial, position_pairs
-from hmmseg.io.units import Column
+from hmmseg.io.units import UNITS, Column
 from hmmseg.robust import runs, white_sd
 
 SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
@@ -145,20 +145,20 @@ def check_lengths(trial: Trial, rig: Rig) -> list[Finding]:
         for name, values in trial.channels.items()
         if name in names and np.isfinite(values).any()
     }  # fmt: skip
-    far = {name: travel for name, travel in travels.items() if travel > REACH}
-    if far:
-        name, travel = max(far.items(), key=lambda item: item[1])
+    name, travel = max(travels.items(), key=lambda item: item[1], default=("", 0.0))
+    if travel > REACH:
         unit, text = "mm", "mm"
         if travel < 100:
-            unit, text = ("cm", 'cm (or "in")') if travel < 30 else ("mm", 'mm (or "cm")')
+            unit, text = ("cm", 'cm (or "mm" or "in")') if travel < 30 else ("mm", 'mm (or "cm")')
         elif travel >= 5e3:
             unit, text = "um", "um"
         problem = f"travels {travel:.4g} m, a hand less than {REACH:g} m: it looks like {text}"
-        mended = far if gripper is None else travels  # one sensor has one unit
+        near = travel * UNITS[unit][1] ** 0.5  # what travels less is in m; a gripper has one unit
+        mended = [n for n, each in travels.items() if each > near or gripper is not None]
         return [Finding(name, problem, changed(mended, rig, unit=unit))]
-    if travels and max(travels.values()) < STILL:
+    if travels and travel < STILL:
         name = next(iter(travels))
-        problem = f"travels {max(travels.values()):.2g} m in all: positions look as if they were in km"
+        problem = f"travels {travel:.2g} m in all: positions look as if they were in km"
         return [Finding(name, problem, changed(travels, rig, unit="mm"), certain=False)]
     return []
 

@@ -132,7 +132,7 @@ class LongRecording:
         row, last = 0, -np.inf
         for trial in self._pieces():
             if trial.t[0] <= last:
-                raise InputError(f"{path}: row {row + 1}, column t", f"{trial.t[0]:g} after {last:g}",
+                raise InputError(f"{path}: row {row + 1}, column t", f"{trial.t[0]:.13g} after {last:.13g}",
                                  "strictly increasing times")  # fmt: skip
             self.t[row : row + trial.t.size] = trial.t
             row, last = row + trial.t.size, trial.t[-1]

@@ -287,33 +287,37 @@ def _range(values: np.ndarray) -> float:
 def _remove_leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:
     """A single position that steps as its velocity does not; the samples in doubt are set to NaN.
 
-    If several positions step, the hand does (backlash).
+    If several positions step, the hand does (backlash). A clock that errs moves all positions at once, each
+    by its velocity, so that the others tell by how much.
     """
-    stepping = {}
-    for name, rate in rates.items():
-        there = np.flatnonzero(np.isfinite(channels[name]) & np.isfinite(channels[rate]))
-        if there.size < MIN_ALIVE:
-            continue
-        q, v, times = channels[name][there], channels[rate][there], t[there]
-        excess = np.diff(q) - np.diff(times) * (v[1:] + v[:-1]) / 2
-        fastest = np.lib.stride_tricks.sliding_window_view(np.pad(np.abs(v), 2, mode="edge"), 6).max(axis=1)
-        covered = fastest * np.diff(times)
-        far = np.abs(excess) > np.maximum(LEAP * robust_sd(excess), FASTEST * covered)
-        far &= np.diff(times) < 1.5 * np.median(np.diff(t))  # velocities do not bridge a gap
-        if far.any():
-            stepping[name] = there, np.where(far, excess, 0.0)
-    if len(stepping) != 1:
+    periods, usual = np.diff(t), float(np.median(np.diff(t)))
+    near = periods < 1.5 * usual  # velocities do not bridge a gap
+    alive = {n: of for n, of in rates.items()
+             if np.isfinite(np.diff(channels[n] + channels[of])[near]).sum() >= MIN_ALIVE}  # fmt: skip
+    q, v = (np.array([channels[n] for n in names]).reshape(-1, t.size) for names in (alive, alive.values()))
+    speeds = (v[:, 1:] + v[:, :-1]) / 2
+    excess = np.where(near, np.diff(q) - periods * speeds, np.nan)
+    noise = np.array([robust_sd(e[np.isfinite(e)]) for e in excess])[:, None]
+    padded = np.pad(np.nan_to_num(np.abs(v)), ((0, 0), (2, 2)), mode="edge")
+    fastest = np.lib.stride_tricks.sliding_window_view(padded, 6, axis=1).max(axis=2)
+    least = np.maximum(LEAP * noise, FASTEST * fastest * periods)
+    stepping = np.flatnonzero((np.abs(excess) > least).any(axis=1))
+    if stepping.size != 1:
         return []
-    name, (there, steps) = next(iter(stepping.items()))
+    k, name = stepping[0], list(alive)[stepping[0]]
+    seen = np.nan_to_num(np.delete([speeds * excess, speeds**2], k, axis=1)).sum(axis=1)
+    error = seen[0] / (seen[1] + (noise[k] / usual) ** 2)
+    far = np.fmin(np.abs(excess[k]), np.abs(excess[k] - speeds[k] * error)) > least[k]
+    steps = np.where(far, excess[k], 0.0)
     at, offset = np.flatnonzero(steps), np.r_[0.0, np.cumsum(steps)]
-    if at.size > STEPS:
+    if not 0 < at.size <= STEPS:
         return []
-    away = np.abs(offset) > np.abs(steps[at]).min() / 2
-    problem = f"jumps by {steps[at[0]]:.3g} at {t[there[at[0] + 1]]:.2f} s, as its velocity does not"
-    if away[-1]:  # it never comes back: either side may be wrong
+    away = np.flatnonzero(np.abs(offset) > np.abs(steps[at]).min() / 2)
+    problem = f"jumps by {steps[at[0]]:.3g} at {t[at[0] + 1]:.2f} s, as its velocity does not"
+    if away[-1] == t.size - 1:  # it never comes back: either side may be wrong
         first, last, why = 0, t.size - 1, ": which side is right nothing tells, so it is left out"
     else:
-        first, last, why = there[away][0], there[away][-1], ", and is left out"
+        first, last, why = away[0], away[-1], ", and is left out"
     channels[name][first : last + 1] = np.nan
     return [Fault(name, problem + why, ((float(t[first]), float(t[last])),))]
 

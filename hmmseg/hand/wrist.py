@@ -68,7 +68,6 @@ def _cancelling(trial: Trial, rig: Rig) -> list[Finding]:
 def _one_finger(rig: Rig) -> list[Finding]:
     """An opening of one column that is named after one of two fingers."""
     gripper = rig.wrist
-    (name, *more) = gripper.opening
     name, *more = gripper.opening
     entry = (rig.columns | rig.topics).get(name)
     of_one = re.search(r"finger.*(\d|left|right)|(left|right).*finger", name.lower()) is not None

@@ -222,7 +222,7 @@ def _check_times(t: np.ndarray, table: Table) -> None:
     back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         i = back[0] + 1
-        raise InputError(f"{where}: row {rows[i]}, column t", f"{t[i]:g} after {t[i - 1]:g}",
+        raise InputError(f"{where}: row {rows[i]}, column t", f"{t[i]:.13g} after {t[i - 1]:.13g}",
                          "strictly increasing times")  # fmt: skip
 
 

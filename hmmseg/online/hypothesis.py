@@ -281,22 +281,24 @@ def _log_known(value, factor, known, q, others, variance, share, span, rising):
 
 @compiled
 def _halting(h, x, span):
-    """Log density ratio of the velocities and height of a hand that halts to one that moves."""
-    out, moving = 0.0, _square(h, VELOCITY)
+    """Log density ratios of a hand that halts to one that moves: of motion aside, and of vertical motion."""
+    aside = upward = 0.0
+    moving = _square(h, VELOCITY)
     if not math.isnan(x.vx):
-        out += log_student(x.vx, math.sqrt(x.sd_vx**2 + moving)) + math.log(span.vx)
+        aside = log_student(x.vx, math.sqrt(x.sd_vx**2 + moving)) + math.log(span.vx)
     if not math.isnan(x.vy):
-        out += log_student(x.vy, math.sqrt(x.sd_vy**2 + moving)) + math.log(span.vy)
+        upward = log_student(x.vy, math.sqrt(x.sd_vy**2 + moving)) + math.log(span.vy)
     if not math.isnan(x.y - x.last_y):
         sd = math.sqrt(2 * x.sd_y**2 + _square(h, LEVEL))
-        out += log_student(x.y - x.last_y, sd) + math.log(span.y)
-    return out
+        upward += log_student(x.y - x.last_y, sd) + math.log(span.y)
+    return aside, upward
 
 
 @compiled
 def free(h, x, span):
     """Log-likelihood of a reading in free motion."""
-    still = _halting(h, x, span)
+    aside, upward = _halting(h, x, span)
+    still = aside + upward
     if not math.isnan(x.d - x.last_d):
         sd = math.sqrt(2 * x.sd_d**2 + _square(h, WIDTH))
         still += log_student(x.d - x.last_d, sd) + math.log(span.d)
@@ -324,14 +326,15 @@ def held(h, known, block, num_blocks, x, span, pads):
 def lifted(h, known, block, num_blocks, x, span, gravity, settled):
     """Log-likelihood of the remaining features, of a block above the ground.
 
-    `settled`: probability that it has been there for a while, and may halt.
+    `settled`: probability that it has been there for a while, and may halt, or keep its height as arms do.
     """
     factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
     fy = _force(h, x, 1) + _force(h, x, 3)
     out = _log_known(fy, factor, known, 2 * block, num_blocks, _carry(h, x), 0.0, span.force, True)
     out += _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy) + _log_broad(x.y, span.y)
     still = STILL * max(settled, JUST_LIFTED)
-    return out + log_sum(math.log1p(-still), math.log(still) + _halting(h, x, span))
+    aside, upward = _halting(h, x, span)
+    return out + log_sum(math.log1p(-2 * still), math.log(still) + upward + log_sum(0.0, aside))
 
 
 @compiled

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
+from hmmseg.hand.plausibility import check_angles, check_lengths
 from hmmseg.hand.signals import level_row
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
-from hmmseg.io.trial import ROLL
+from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import GAP
 from hmmseg.online.answer import Answer
 from hmmseg.online.filter import Filter
@@ -22,6 +23,7 @@ from hmmseg.online.wrist import Wrist, checked
 LAG = 1.0  # chosen: s; default lag: contacts ring for a fifth of that
 SNAPSHOTS = 10  # numerics: points per lag to which a late row can return
 USUAL = 0.02  # numerics: update rate of the usual interval
+JUDGED = 20  # numerics: rows of which one is looked at for readings that no hand has
 ODD = {
     "repeated": "repeated: the row at {t:.9g} s came before, and counts once",
     "contradictory": "contradictory: another row at {t:.9g} s came before; the first one counts",
@@ -51,7 +53,7 @@ class Watcher:
             raise InputError("task", "a plain ordered task cannot be watched", "objects and moves")
         if not 0 <= lag < math.inf:
             raise InputError("lag", f"found {lag}", "0 s or more")
-        self.filter = Filter(description, hand, float(lag))
+        self.lag, self.filter = float(lag), Filter(description, hand, float(lag))
         self._wrist = None if hand.gripper is None else Wrist(hand)
         self.channels, self.optional = self.filter.channels, self.filter.optional
         if not hand.jointed and self._wrist is None:
@@ -61,6 +63,8 @@ class Watcher:
         self.counts: Counter[str] = Counter()
         self._mark: Any = None  # snapshot of the start of a wrist gripper's last grip
         self._snapshots: deque[tuple[float, Any]] = deque(maxlen=SNAPSHOTS + 1)
+        self._looked: deque[np.ndarray] = deque(maxlen=3)
+        self._ends = np.full((2, 1), np.nan)  # least and greatest of the middle ones
         self._roll = 0.0  # last recorded roll of the hand [rad]
         self._every = max(float(lag), 0.1) / SNAPSHOTS
         self._usual = 1.0 / hand.rate if hand.rate else math.nan
@@ -73,11 +77,6 @@ class Watcher:
             return math.nan, math.nan
         fx1, fy1, fx2, fy2 = rows[-1][1][[4, 5, 10, 11]]
         return float(fx1 - fx2) / 2, float(fy1 + fy2)
-
-    @property
-    def lag(self) -> float:
-        """Delay after which a boundary is settled [s]."""
-        return self.filter.lag
 
     def update(self, t: float, channels: Sequence[float] | Mapping[str, float] | np.ndarray) -> Answer:
         """Process one row.
@@ -92,7 +91,7 @@ class Watcher:
 
         Raises:
             ValueError: for another number of channels, or a time that is not finite.
-            InputError: for an impossible orientation, or lifts that pull up.
+            InputError: for an impossible orientation, positions or angles, or lifts that pull up.
         """
         if isinstance(channels, Mapping):
             channels = [channels.get(name, math.nan) for name in self.channels]
@@ -106,6 +105,8 @@ class Watcher:
         if not math.isfinite(t):
             raise ValueError(f"t: {t}, expected a time in s")
         self.counts["rows"] += 1
+        if self.counts["rows"] % JUDGED == 0:
+            self._check_units(row)
         note = self._take(t, row) if self._wrist is None else self._take_wrist(self._wrist, t, row)
         answer = self.filter.answer()
         answer.note = note
@@ -116,6 +117,18 @@ class Watcher:
         if not math.isnan(row[-1]):
             self._roll = float(row[-1])
         return level_row(row[:-1], self._roll) if self._roll else row[:-1]
+
+    def _check_units(self, row: np.ndarray) -> None:
+        """InputError once readings show what no hand does, such as millimetres taken for m."""
+        self._looked.append(row)
+        middle = np.sort(self._looked, axis=0)[len(self._looked) // 2]  # of three: one may be wild
+        self._ends = np.array([np.fmin(self._ends[0], middle), np.fmax(self._ends[1], middle)])
+        ends = dict(zip(self.channels, self._ends.T, strict=False))
+        trial, rig = Trial("stream", np.array([0.0, 1.0]), ends), self.filter.rig
+        for found in (*check_lengths(trial, rig), *check_angles(trial, rig)):
+            if found.certain:  # which other columns are in this unit may not show yet
+                remedy = f'{found.channel} = {{unit = "..."}} and the like under [columns] in rig.toml'
+                raise InputError(f"stream: column {found.channel}", found.problem, remedy)
 
     def _take(self, t: float, row: np.ndarray) -> str | None:
         """Process a row; returns its irregularity."""

@@ -121,7 +121,7 @@ def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
         raise InputError(where, "has no boundary", "at least one time in s")
     if boundaries[at[0]] < trial.t[0] or boundaries[at[-1]] > trial.t[-1]:
         raise InputError(where, f"has boundaries {boundaries[at].tolist()}",
-                         f"times between {trial.t[0]:g} and {trial.t[-1]:g} s")  # fmt: skip
+                         f"times between {trial.t[0]:.13g} and {trial.t[-1]:.13g} s")  # fmt: skip
     for i, k in pairwise(at):
         gap = boundaries[k] - boundaries[i]
         if gap < 0 or (gap == 0 and not set(task.sequence[i + 1 : k + 1]) <= set(task.optional)):

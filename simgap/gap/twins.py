@@ -8,7 +8,7 @@ like these (`simgap.attribution.search.detected`).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -72,13 +72,7 @@ def scene_of(rig: Rig, blocks: Blocks, effects: Values) -> tuple[Rig, Surroundin
     return hand, around, blocks
 
 
-def recorded(
-    simulated: SimulatedTrial,
-    task: BlockTask,
-    rig: Rig,
-    effects: Values,
-    change: Callable[[Performance], Performance] | None = None,
-) -> Trial:
+def recorded(simulated: SimulatedTrial, task: BlockTask, rig: Rig, effects: Values) -> Trial:
     """What the nominal hand's sensors record of a simulated trial under the given effects.
 
     Args:
@@ -86,7 +80,6 @@ def recorded(
         task: The task.
         rig: The nominal hand.
         effects: Parameters of each effect.
-        change: A further change of what the sensors see.
     """
     rng = np.random.default_rng([simulated.seed, 7])
     motion = simulated.motion
@@ -101,7 +94,6 @@ def recorded(
     )
     chosen = [effect_named(n) for n in effects]
     truth = altered(truth, effects, rng)
-    truth = truth if change is None else change(truth)
     t = times = simulated.trial.t
     for effect in chosen:
         if effect.sampled is not None:

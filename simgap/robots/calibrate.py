@@ -32,7 +32,7 @@ STAGES = 4  # look: stages that a progress bar counts
 LONGEST = 20.0  # numerics: s that a log is run freely at most
 STEPS, AGAIN = 30, 4  # numerics: steps of a fit, and of one that begins where another ended
 ROUNDS = 2  # numerics: fits, each in units of the residual of the last one
-LEAVES = 4.0  # numerics: squares over the noise's, from which laws that a model lacks are fitted too
+LEAVES = 4.0  # numerics: squares over the noise's, from which what a model lacks is fitted, and told
 UNTOLD = 0.5  # chosen: share of the prior's sd; a parameter with more left is not determined by the logs
 NOTHING = 0.05  # numerics: a correlation up to which there is none
 COUPLED = 0.05  # numerics: weight in an undetermined direction from which a parameter belongs to it
@@ -45,7 +45,7 @@ class Calibration:
     `composed`: the model along whole logs; `point`: the best fit; `names`: effect and parameter, in the order
     of what follows; `sd`: the priors' standard deviations (p,); `covariance`: of the fit (p, p);
     `information`: of the logs (p, p), in units of `sd`; `before`, `after`: root mean squares by channel of
-    free runs along held-out logs, nominal and fitted.
+    free runs along held-out logs, nominal and fitted; `left`: of the fit's residuals over their noise.
     """
 
     composed: Composed
@@ -56,6 +56,7 @@ class Calibration:
     information: np.ndarray
     before: Mapping[str, float]
     after: Mapping[str, float]
+    left: Mapping[str, float]
 
     @property
     def determined(self) -> np.ndarray:
@@ -210,7 +211,9 @@ def calibrate(
     names, sd, information, covariance = _sensitivities(whole.moved(found), found, linear, whiten, stated)
     tell("held-out logs")
     before, after = _held_out(whole.moved(found), found, stated) if judged else ({}, {})
-    return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after)
+    noiseless = without_starts(whole, linear, np.sqrt(linear.rows.variance))
+    left = linear.rows.rms(noiseless(np.nan_to_num(linear.residual)))
+    return Calibration(whole.moved(found), found, names, sd, covariance, information, before, after, left)
 
 
 def _stretches(recordings: Sequence[Recording]) -> list[Recording]:

@@ -106,7 +106,7 @@ def test_a_channel_without_observations_keeps_its_prior():
 def test_prior_of_a_sum_against_drawn_sums(terms):
     """Fenton's log-normal has the moments of the sum; of one property it is its very prior."""
     rng = np.random.default_rng(6)
-    mean, sd = priors.property_priors([("a", "height")])
+    mean, sd = np.log(priors.PROPERTY_MEDIAN["height"]), priors.PROPERTY_LOG_SD["height"]
     values = np.exp(mean + sd * rng.normal(size=(400_000, len(terms)))) @ np.array(terms)
     grid = np.linspace(1e-4, 3.0, 300_000)
     density = np.exp(priors.log_prior("height", np.array(terms), grid))

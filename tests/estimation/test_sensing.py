@@ -177,6 +177,14 @@ def test_healthy_recordings_show_no_fault():
         assert remove_faults(trial_of(read_table(path), rig, None), rig).faults == ()
 
 
+def test_a_clock_that_errs_is_no_encoder_that_loses_counts():
+    rig = read_rig(FOLDER / "rig.toml")
+    jitter = np.random.default_rng(0).normal(0.0, 0.012, (40, TABLE["t"].size))
+    for late in jitter:
+        table = TABLE | {"t": np.sort(TABLE["t"] + late)}
+        assert not any("jumps by" in line for line in read_trial(table, rig).warnings)
+
+
 @pytest.mark.parametrize("step", [0.02, 0.05, 0.2])
 def test_coarse_forces_and_forces_held_for_some_samples_are_none(step):
     rig = read_rig(FOLDER / "rig.toml")

@@ -34,6 +34,7 @@ def swapped(table):
 
 
 DEG = 180 / np.pi
+LOW = changed(CARTESIAN, y=0.5, vy=0.5)
 MISFITS = {
     "t in ms, rate known": (JOINT, changed(JOINT, t=1e3), JOINTED, r"column t: .*rate = 20 .*looks like ms"),
     "t in us": (CARTESIAN, changed(CARTESIAN, t=1e6), FREE, "column t: .*looks like us"),
@@ -42,6 +43,7 @@ MISFITS = {
     "positions in mm": (CARTESIAN, changed(CARTESIAN, x=1e3, y=1e3), FREE, "travels .*looks like mm"),
     "all in mm": (CARTESIAN, changed(CARTESIAN, x=1e3, y=1e3, vx=1e3, vy=1e3), FREE, "looks like mm"),
     "positions in cm": (CARTESIAN, changed(CARTESIAN, x=1e2, y=1e2), FREE, "looks like cm"),
+    "low lifts in cm": (LOW, changed(LOW, x=1e2, y=1e2, vx=1e2, vy=1e2), FREE, "it looks like cm"),
     "x1 alone in mm": (CARTESIAN, {**CARTESIAN, "x1": CARTESIAN["x1"] * 1e3}, FREE, "column x1: travels"),
     "velocities in mm/s": (CARTESIAN, changed(CARTESIAN, vx=1e3, vy=1e3), FREE, "times what x1 changes by"),
     "angles in deg": (JOINT, changed(JOINT, q=DEG, dq=DEG), JOINTED, "turns of a link: it looks like deg"),

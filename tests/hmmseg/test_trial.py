@@ -128,6 +128,7 @@ REFUSED_CSV = [
     (cell(2, "t", "soon"), "row 2, column t: soon is not a finite number"),
     (cell(4, "t", ""), "row 4, column t: missing; expected a time in s"),
     (cell(4, "t", "0.05"), "row 4, column t: 0.05 after 0.05; expected strictly increasing times"),
+    (cell(4, "t", "1700000000.1"), "row 5, column t: 0.15 after 1700000000.1; expected strictly"),
     (cell(4, "t", "-1"), "row 4, column t: -1 after 0.05; expected strictly increasing"),
     ("\n" + csv(lambda lines: lines[1:]), "column t: missing; expected a header row"),
     (csv(lambda lines: [*lines[:4], "", "", cell(5, "q11", "?").splitlines()[4], *lines[5:]]),

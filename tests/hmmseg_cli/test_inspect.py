@@ -81,11 +81,13 @@ def test_what_is_in_a_file(tmp_path):
     t = np.delete(np.arange(100) * 0.02, [40, 41, 42, 43, 44])
     force = np.sin(t)
     force[3] = np.nan
-    pd.DataFrame({"t": t, "force [N]": force, "note": "x"}).to_csv(tmp_path / "a.csv", index=False)
+    table = pd.DataFrame({"t": t, "force [N]": force, "note": "x", "left": np.nan})
+    table.to_csv(tmp_path / "a.csv", index=False)
     found = inspect(tmp_path / "a.csv")
     assert (found.samples, found.rate, found.end) == (95, pytest.approx(50.0), pytest.approx(1.98))
     assert found.gaps == ((pytest.approx(0.78), pytest.approx(0.9)),)
-    _, channel, note = found.channels
+    _, channel, note, left = found.channels
+    assert left.rate is None and left.missing == 95
     assert (channel.unit, channel.missing, note.text, found.mapping) == ("N", 1, True, {})
     assert channel.maximum == pytest.approx(np.nanmax(force))
 
@@ -235,10 +237,11 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
 
     (tmp_path / "robot.xml").write_text(
         '<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size=".1"/></body></worldbody>'
-        '<actuator><motor name="elbow" joint="elbow"/></actuator></mujoco>'
+        '<actuator><motor name="m1" joint="elbow"/></actuator></mujoco>'
     )
     (tmp_path / "log.csv").write_text(
-        "stamp,elbow_deg,elbow_vel,elbow_cmd,room\n" + "".join(f"{k / 100},1,2,3,4\n" for k in range(20))
+        "ros_stamp,elbow_deg,elbow_vel,elbow_cmd,tau_elbow,room\n"
+        + "".join(f"{1700000000000000000 + k * 10000000},1,2,3,5,4\n" for k in range(20))
     )
     given = ["--mjcf", str(tmp_path / "robot.xml"), "--from", str(tmp_path / "log.csv")]
     assert main(["new", str(tmp_path), *given]) == 0
@@ -246,9 +249,9 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
     found = read_map(tmp_path / "map.toml")
     assert {n: (m.thing, m.kind) for n, m in found.columns.items()} == {
         "elbow_deg": ("joint", "position"), "elbow_vel": ("joint", "velocity"),
-        "elbow_cmd": ("actuator", "command"),
+        "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force"),
     }  # fmt: skip
-    assert found.time == "stamp"
+    assert (found.clock.column, found.clock.size) == ("ros_stamp", 1e-9)
     assert main(["new", str(tmp_path / "other"), "--mjcf", str(tmp_path / "robot.xml")]) == 2
 
 

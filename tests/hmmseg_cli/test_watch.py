@@ -62,6 +62,16 @@ def test_bad_input_gets_one_line(run, change, message):
     assert len(err.splitlines()) == 1 and message in err
 
 
+def test_angles_in_degrees_are_refused_as_in_a_file(run):
+    cells = [row.split(",") for row in ROWS[1:110]]
+    angles = [k for k, name in enumerate(ROWS[0].split(",")) if name[0] in "qd"]
+    rows = [",".join(str(57.3 * float(c)) if k in angles else c for k, c in enumerate(row)) for row in cells]
+    code, _, err = run([ROWS[0], *rows])
+    assert code == 2 and "it looks like deg; expected q" in err
+    wild = [*ROWS[:60], ",".join([ROWS[60].split(",")[0], *["999"] * 12]), *ROWS[61:110]]
+    assert run(wild)[0] == 0  # a single row is no unit
+
+
 def test_a_stream_as_a_spreadsheet_has_it(run):
     """Semicolons, decimal commas, remarks, a row of units and ISO stamps: the answers of the plain stream."""
     plain = run(ROWS[:60])[1]
@@ -79,6 +89,12 @@ def test_a_stream_as_a_spreadsheet_has_it(run):
     assert lines[30]["t"] == pytest.approx(plain[30]["t"])
     code, _, err = run([*rows[:10], rows[10].replace("2026", "morgen"), *rows[11:]])
     assert code == 2 and "column t: 'morgen" in err
+
+
+def test_a_rig_without_pads_is_told(run, tmp_path):
+    (tmp_path / "rig.toml").write_text(re.sub(r"\[fingertip\][^\[]*", "", (CASE / "rig.toml").read_text()))
+    code, lines, _ = run(ROWS[:20], "--rig", str(tmp_path / "rig.toml"))
+    assert code == 0 and any("states no [fingertip]" in line for line in lines[-1]["warnings"])
 
 
 def test_bad_rows_can_be_left_out(run):

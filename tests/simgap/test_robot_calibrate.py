@@ -9,7 +9,7 @@ from simgap_swing import Swing, log
 from hmmseg.errors import InputError
 from hmmseg_cli.main import main
 from simgap.robot_effects import effects_of
-from simgap.robots.calibrate import calibrate
+from simgap.robots.calibrate import LEAVES, calibrate
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.rows import noises
@@ -36,7 +36,9 @@ def found_of(robot, logs):
 
 def test_planted_values_are_found_with_their_errors_and_held_out_logs_are_nearer():
     true = {"inertia": 0.014, "viscous": 0.02, "torque_scale": 1.3}
-    body = found_of(Guessed(), [log(s, seconds=1.5, **true) for s in range(2)]).body()
+    found = found_of(Guessed(), [log(s, seconds=1.5, **true) for s in range(2)])
+    body = found.body()
+    assert found.left["angle"] < 1.1
     for name, value in true.items():
         told = body["parameters"][name]
         assert told["mean"] == pytest.approx(value, rel=0.01)
@@ -74,6 +76,12 @@ def test_one_log_is_held_out_by_halves_and_nothing_uncertain_is_said():
     assert body["heldout"]["after"]["angle"] < 0.2 * body["heldout"]["before"]["angle"]
     with pytest.raises(InputError, match="nothing of the model is uncertain"):
         found_of(Swing(), [log(0)])
+
+
+def test_what_no_fitted_parameter_explains_is_told():
+    logs = [log(s, seconds=1.5) for s in range(2)]
+    found = found_of(Guessed(), [each.with_columns({"angle": each["angle"] + 0.05}) for each in logs])
+    assert found.left["angle"] > LEAVES**0.5
 
 
 ROBOT = """<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/>

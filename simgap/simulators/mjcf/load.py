@@ -38,7 +38,7 @@ class Loaded:
         """Read a log in SI units, as the map says; InputError where a unit cannot be right."""
         columns = self.map.columns
         raw = read_recording(
-            path, columns, self.map.time, self.map.time_factor,
+            path, columns, self.map.clock.column, self.map.clock.size,
             [name for name, mapped in columns.items() if mapped.kind == "command"], self.simulator.acts,
         )  # fmt: skip
         values = {n: m.factor * raw[n] + m.offset for n, m in columns.items()}
@@ -114,7 +114,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
             body.simple = False
     model = compiled(spec)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    simulator, warnings = _simulator(model, described, address)
+    simulator, warnings = _simulator(model, described, str(map_file), address)
     simulator.spec = spec
     whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, whole)
@@ -159,10 +159,9 @@ def _add_sensors(spec: Any, columns: Mapping[str, Mapped]) -> dict[str, tuple[st
 
 
 def _simulator(
-    model: Any, described: Map, address: Mapping[str, tuple[str, int]]
+    model: Any, described: Map, file: str, address: Mapping[str, tuple[str, int]]
 ) -> tuple[MjcfSimulator, list[str]]:
     """The simulator without parameters, and warnings of what its columns leave open."""
-    file = described.file
     channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
     for column, m in described.columns.items():
         unit = _unit(model, m)

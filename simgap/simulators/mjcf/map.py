@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -138,7 +138,6 @@ class Map(StrictTable):
     uncertain: tuple[Name, ...] = ()
     sd: dict[Name, FinitePositive] = Field(default_factory=dict)
     payload_at: dict[Name, Place] = Field(default_factory=dict)
-    _file: str = ""
 
     @field_validator("columns")
     @classmethod
@@ -147,45 +146,26 @@ class Map(StrictTable):
             raise ValueError("are all commands: nothing to compare; expected a joint, sensor or body")
         return columns
 
-    @property
-    def file(self) -> str:
-        """The file that it was read from."""
-        return self._file
-
-    @property
-    def time(self) -> str:
-        """The name of the time column."""
-        return self.clock.column
-
-    @property
-    def time_factor(self) -> float:
-        """Its unit [s]."""
-        return self.clock.size
-
 
 def read_map(path: Path) -> Map:
     """Read a map from a TOML file; InputError names the key at fault."""
-    found = validated(Map, read_toml(path), str(path))
-    found._file = str(path)
-    return found
+    return validated(Map, read_toml(path), str(path))
 
 
 SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}
 COMMANDS = {"cmd", "command", "u", "ctrl", "target", "des"}
+EFFORTS = {"tau", "torque", "effort"}
 
 
-def proposed_map(xml: Path, columns: Sequence[tuple[str, str | None]]) -> tuple[str, list[str]]:
+def proposed_map(
+    xml: Path, columns: Sequence[tuple[str, str | None]], clock: Mapping[str, Any]
+) -> tuple[str, list[str]]:
     """Propose a map for a model and the columns of a log.
 
-    A column is the joint, actuator or sensor with the longest name that it contains: a joint's velocity where
-    it speaks of speed, an actuator where it speaks of a command.
-
-    Args:
-        xml: The model.
-        columns: Name and unit of each column.
-
-    Returns:
-        The map's text, and the columns that no name decides.
+    A column (name, unit) is the joint, actuator or sensor with the longest name that it contains: a joint's
+    velocity where it speaks of speed; where it speaks of a command or a torque an actuator, by its own or its
+    joint's name. `clock`: which column counts the time (`from`), and its `unit`, where that is not t in s.
+    Returns the map's text, and the columns that no name decides; InputError for a model that cannot be read.
     """
     from simgap.simulators.mjcf.engine import mujoco
     from simgap.simulators.mjcf.setting import names_of
@@ -194,23 +174,31 @@ def proposed_map(xml: Path, columns: Sequence[tuple[str, str | None]]) -> tuple[
         model = mujoco.MjModel.from_xml_path(str(xml))
     except (ValueError, OSError) as error:
         raise InputError(str(xml), f"cannot be read: {error}", "a MuJoCo model") from None
-    kinds = ("actuator", "joint", "sensor")
-    known = {kind: sorted(names_of(model, kind), key=len, reverse=True) for kind in kinds}
+    known = {kind: {n: n for n in names_of(model, kind)} for kind in ("actuator", "joint", "sensor")}
+    for name in known["actuator"].copy():
+        actuator = model.actuator(name)
+        if actuator.trntype[0] == mujoco.mjtTrn.mjTRN_JOINT:
+            known["actuator"].setdefault(model.joint(actuator.trnid[0]).name, name)
+    time = clock.get("from", "t")
     lines, left = [f"# Which column is which part of {xml.name}; SI where no unit is given."], []
+    if clock:
+        unit = f", unit = {json.dumps(clock['unit'])}" if "unit" in clock else ""
+        lines.append(f"time = {{column = {json.dumps(time)}{unit}}}")
     for name, unit in columns:
-        said = set(re.split(r"[^a-z0-9]+", name.lower()))
-        order = ("actuator", "joint", "sensor") if said & COMMANDS else ("joint", "sensor", "actuator")
-        part = next(((kind, n) for kind in order for n in known[kind] if n.lower() in name.lower()), None)
-        if name == "t" or (part is None and said & {"t", "time", "stamp", "timestamp"}):
-            lines += [] if name == "t" else [f'time = "{name}"']
+        if name == time:
             continue
+        said = set(re.split(r"[^a-z0-9]+", name.lower()))
+        driven = said & (COMMANDS | EFFORTS)
+        order = ("actuator", "joint", "sensor") if driven else ("joint", "sensor", "actuator")
+        longest = ((kind, n) for kind in order for n in sorted(known[kind], key=len, reverse=True))
+        part = next(((kind, known[kind][n]) for kind, n in longest if n and n.lower() in name.lower()), None)
         if part is None:
             left.append(name)
             joints = ", ".join(known["joint"])
             lines += [f"# [columns.{json.dumps(name)}]", f'# joint = "..."  # one of {joints}']
             continue
-        lines += [f"[columns.{json.dumps(name)}]", f'{part[0]} = "{part[1]}"']
+        lines += [f"[columns.{json.dumps(name)}]", f"{part[0]} = {json.dumps(part[1])}"]
         lines += ['kind = "velocity"'] if part[0] == "joint" and said & SPEEDS else []
-        lines += [f'unit = "{unit}"'] if unit else []
-    tops = [line for line in lines if line.startswith("time")]
-    return "\n".join([lines[0], *tops, *(x for x in lines[1:] if x not in tops)]) + "\n", left
+        lines += ['kind = "force"'] if part[0] == "actuator" and not said & COMMANDS and driven else []
+        lines += [f"unit = {json.dumps(unit)}"] if unit else []
+    return "\n".join(lines) + "\n", left
