@@ -58,7 +58,7 @@ OFFCENTRE_MASS = HandEffect(
     mistaken_for=("force_crosstalk", "force_bias"),
     called="a block heavier on one side",
     check="Balance the block on an edge under its middle.",
-    parameters={"offset": Parameter(0.0, 0.003, "m")},
+    parameters={"offset": Parameter(0.0, 0.003, "m", low=-0.01, high=0.01)},  # within a usual block
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(couple=w.couple + v["offset"]),
     apply=_apply_offcentre_mass,

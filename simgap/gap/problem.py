@@ -204,6 +204,7 @@ def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of all coordinates."""
     places, total = slots(given.num_common)
     low, high = np.full(total, -np.inf), np.full(total, np.inf)
+    low[given.centre.size : given.num_common] = 0.0  # blocks turn towards a moment
     for slot in places:
         for j, p in enumerate(slot.effect.parameters.values()):
             low[slot.start + j], high[slot.start + j] = p.limits
