@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+from scipy.stats import chi2
 
 from hmmseg.errors import InputError
 from simgap.attribution.heldout import (
@@ -283,15 +284,18 @@ def _explanation(
 def _small(
     f: Forms, models: list[Model], by_group: np.ndarray, absorbed: np.ndarray | None
 ) -> SmallGap | None:
-    """The gap's size if it does not matter: neither residuals, nor their statistic, nor shifts of properties
-    do.
+    """The gap's size if it does not matter: neither residuals, nor their statistic, nor what nuisances hide
+    of it do.
     """
     assert f.gap.tolerance is not None
     small = small_gap(f, np.minimum(by_group, 1.0), f.gap.tolerance)
     if small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM:
         return None
+    without = fitted(f, ()).x[: f.spectrum.num_nuisances]
+    if chi2.sf(without @ without, without.size) < ALARM:  # they are where they never are
+        return None
     if absorbed is not None:
-        moved = np.abs(models[0].x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
+        moved = np.abs(models[0].x[: absorbed.size] - without[: absorbed.size])
         if (moved > absorbed).any():
             return None
     return small

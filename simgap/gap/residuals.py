@@ -321,7 +321,7 @@ def residuals(
     apart = block_offset(y2 - y1, fy1, fy2, pads_give)
     turn, tipped = turned(world, weight, width, turning, force, apart)
     # Grips at unequal heights are nearer to each other on a block that turns towards the lower one.
-    sine = np.sin(turn + world.tilt - world.hang * world.carry)
+    sine = np.sin(turn)
     gap = x2 - x1 - width + sine * (apart - width * sine / 2)
     squeeze = block_width(0.0, fx1, fx2, pads_give)
     # Pads that have crept recover late: fingers may be closer for a while without pressing.
