@@ -252,7 +252,7 @@ def attribute(
     somewhere = verdict.verdict != "none" or small is not None
     return Attribution(
         **vars(verdict),
-        effects=_effects(f, models, chance, examined, _alone(f, verdict.causes)),
+        effects=_effects(f, models, chance, examined, model),
         detection=detection,
         remainder=Remainder(remains, p_rest, unexplained),
         where=significant(gap.rows, f.spectrum.band, before, sd) if somewhere else (),
@@ -311,11 +311,6 @@ def _forced(f: Forms, names: tuple[str, ...]) -> Model:
     for name in names:
         if name not in possible:
             raise InputError(f"effect {name!r}", "cannot act on these recordings", ", ".join(possible))
-    return _alone(f, names)
-
-
-def _alone(f: Forms, names: Iterable[str]) -> Model:
-    """The best fit of these effects and no others, one form of each."""
     forms_of = [[j for j, c in enumerate(f.gap.candidates) if c.name == name] for name in names]
     sets = {tuple(sorted(each)) for each in product(*forms_of)}
     return max((fitted(f, each) for each in sets), key=lambda m: m.score)
