@@ -397,7 +397,7 @@ def turned(
         apart: Height (T, N) of the right contact over the left [m].
     """
     grip, shear = (force[..., k] - force[..., 2 + k] for k in (0, 1))
-    moment = grip / 2 * apart - shear * width / 2 - weight * world.couple
+    moment = grip / 2 * apart - shear * width / 2 - weight * world.couple * world.carry
     load = np.maximum(weight - force[..., 1] - force[..., 3], 0.0) * (1 - world.carry)
     turn, rise = np.zeros_like(weight), np.zeros_like(weight)
     for share, compliance in zip(STANCES, turning, strict=True):
