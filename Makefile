@@ -99,16 +99,13 @@ gap-labs: $(INSTALLED)  ## diagnoses of open labs in the folder LABS; fills docs
 	$(BIN)/python -m experiments.write_tables
 
 FRESH := experiments/results/gap_fresh.json
-HEALTHY_SEEDS := 271601 271701
-ACTING_SEEDS := 271611 271711
 DRAWN := $(BIN)/python -m experiments.gap_drawn --results build/gap_fresh --output $(FRESH)
 gap-fresh: $(INSTALLED)  ## diagnoses of labs of our own second simulator, drawn anew; fills docs/gap_results.md
-	for seed in $(HEALTHY_SEEDS); do \
-	  $(BIN)/python -m experiments.blind_check open --cases 30 --seed $$seed --tiers healthy --out build/$$seed || exit; done
-	for seed in $(ACTING_SEEDS); do \
-	  $(BIN)/python -m experiments.blind_check open --cases 48 --seed $$seed --tiers single pair outside --out build/$$seed || exit; done
-	$(DRAWN) build/271601 build/271611 --run "seen before"
-	$(DRAWN) build/271701 build/271711 --run "judged once"
+	set -e; open() { $(BIN)/python -m experiments.blind_check open --seed $$1 --cases $$2 --out build/$$1 --tiers $$3; }; \
+	  open 271701 30 healthy; open 271801 20 healthy; \
+	  open 271711 48 "single pair outside"; open 271811 36 "single pair outside"
+	$(DRAWN) build/271701 build/271711 --run "seen before"
+	$(DRAWN) build/271801 build/271811 --run "judged once"
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md

@@ -80,9 +80,8 @@ def tracked(
     constant each, a random walk of variances `walk` (T, N, 3) that is replaced by a new one of variance
     `anywhere` where `new` (T, N, 3): the first weighted value determines it and gives no innovation. A joint
     is at its `place` (T, N, J) where `pinned`; elsewhere it moves by `drift` with variance `wander`, plus one
-    of `shares` (R,) of the variance `jump` (T, J). The likeliest share is chosen sample by sample (a
-    multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976). How often each is chosen is learned
-    from the choices before: their probabilities have a Dirichlet prior with `chance` (R,) as its counts.
+    of `shares` (R,) of the variance `jump` (T, J) with prior probabilities `chance` (R,). The likeliest share
+    is chosen sample by sample (a multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
 
     Returns:
         Innovations (T, N, 4), their variances over the noise's, and the cost of the choices [nats].
@@ -90,7 +89,7 @@ def tracked(
     joints, size = pinned.shape[2], pinned.shape[2] + 3
     out, factor, cost = np.zeros_like(values), np.ones_like(values), 0.0
     constant = np.array([joints, joints + 1, -1, joints + 2])
-    lever, counts = np.zeros(size), chance.copy()
+    lever = np.zeros(size)
     for t in range(values.shape[0]):
         mean, cov, fresh = np.zeros(size), np.zeros((size, size)), np.ones(size)
         for k in range(values.shape[1]):
@@ -113,13 +112,13 @@ def tracked(
                     cov[j, j] += wander[t, k, j]
                 loose = loose or not pinned[t, k, j]
             choices = chance.size if loose and weight[t, k].sum() > 0 else 1
-            best, chosen, chosen_mean, chosen_cov, paid = -np.inf, 0, mean, cov, 0.0
+            best, chosen_mean, chosen_cov, paid = -np.inf, mean, cov, 0.0
             for r in range(choices):
                 m, p = (mean.copy(), cov.copy()) if choices > 1 else (mean, cov)
                 for j in range(joints):
                     if not pinned[t, k, j]:
                         p[j, j] += shares[r] * jump[t, j]
-                score = np.log(counts[r] / counts.sum()) if choices > 1 else 0.0
+                score = np.log(chance[r]) if choices > 1 else 0.0
                 prior = score
                 misses, factors = np.zeros(4), np.ones(4)
                 for c in range(4):
@@ -137,11 +136,9 @@ def tracked(
                     misses[c] = np.sqrt(known * factors[c] / larger) * w * miss
                     score -= 0.5 * (np.log(factors[c]) + misses[c] ** 2 / (noise * factors[c]))
                 if score > best:
-                    best, chosen, chosen_mean, chosen_cov, paid = score, r, m, p, -prior
+                    best, chosen_mean, chosen_cov, paid = score, m, p, -prior
                     out[t, k], factor[t, k] = misses, factors
             cost += paid
-            if choices > 1:
-                counts[chosen] += 1.0
             mean, cov = chosen_mean, chosen_cov
             for c in range(4):
                 if constant[c] >= 0:

@@ -192,16 +192,14 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     path = side + (1 - unseen) * np.where(free, own - before * (1 - share) - after * share, 0.0)
     place = np.clip(path, -band, band)
     seen = np.square(_noise(world.rates)[:, None] * np.median(step))
-    # Unseen it crosses at any speed up to twice the mean one.
-    slope = np.diff(side, axis=1, prepend=side[:, :1])
     # Changes within the noise pin nothing.
     went_on = np.abs(np.diff(calm, axis=1))
     far = np.pad(went_on, ((0, 0), (1, 0), (0, 0))) + np.pad(went_on, ((0, 0), (0, 1), (0, 0)))
     return DeadBand(
         place,
         (last == following) & (rest == 1) & (far > HUSH * _noise(world.joints)[:, None]),
-        (1 - unseen) * np.diff(own, axis=1, prepend=own[:, :1]) + unseen * slope,
-        (1 - unseen) * seen + unseen * np.square(slope) / 3,
+        (1 - unseen) * np.diff(own, axis=1, prepend=own[:, :1]),
+        np.broadcast_to((1 - unseen) * seen, place.shape),
         np.square(unseen * band[:, 0]) * ANYWHERE,
     )
 

@@ -323,7 +323,7 @@ def gap_of(
         shifting = [_shifting(problem, f, healthy) for f in fits]
         measured = [c for c in _measured(problem, healthy) if c.parameters in seen]
         every = (*shifting, *scattering, *measured)
-        residual = healthy.residual - healthy.jacobian @ healthy.u[: healthy.columns.size]
+        residual = _at_nominal(healthy, healthy)
         return Gap(rows, residual, nuisance, every, tolerance=tolerance, usual=usual)
 
     gap = at(given, healthy, fits)
@@ -371,7 +371,9 @@ def together(
 def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
     """The effects of a joint fit as separate candidates."""
     k = given.num_common
-    all_of_them, alone = _shift(given, joint), []
+    # The shift by all of them.
+    all_of_them = healthy.residual - joint.residual - healthy.jacobian @ (healthy.u[:k] - joint.u[:k])
+    alone = []
     for key in joint.effects:
         u = joint.u.copy()
         own = columns_of(given, (key,))[k:]
@@ -400,9 +402,10 @@ def after(
     def of(problem: Problem, healthy: Fitted, first: Fitted, joint: Sequence[Fitted]) -> Gap:
         one, own = _shifting(problem, first, healthy), []
         for f in joint:
+            both = _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
             by_first = one.shift + one.jacobian @ (f.u[first.columns[problem.num_common :]] - one.at)
             mine = slice(first.columns.size, None)
-            own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, _shift(problem, f) - by_first,
+            own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - by_first,
                                   f.jacobian[:, mine], f.doubts - first.doubts))  # fmt: skip
         return replace(gap, candidates=(*gap.candidates, *own))
 
@@ -441,18 +444,16 @@ def _turning(given: Problem, angle: float) -> np.ndarray:
     return np.square(size[there]) * (stands & (distance | offset | (y & ~mean)))
 
 
-def _shift(given: Problem, f: Fitted) -> np.ndarray:
-    """What the effects of a fit take from the residuals (n,), properties as they are there.
-
-    Effects of no size shift nothing, whatever the properties do far from where they were linearised.
-    """
-    return residual_at(given, (), f.u)[given.there] - f.residual
+def _at_nominal(f: Fitted, healthy: Fitted) -> np.ndarray:
+    """The residual (n,) of a fit with properties at their nominal values, to first order."""
+    return f.residual - healthy.jacobian @ f.u[: healthy.columns.size]
 
 
 def _shifting(given: Problem, f: Fitted, healthy: Fitted) -> Candidate:
-    """A fit of one effect as a candidate."""
-    k, doubts = given.num_common, f.doubts - healthy.doubts
-    return _candidate(given, f.effects[0], f.columns[k:], f.u, _shift(given, f), f.jacobian[:, k:], doubts)
+    """A fit of one effect as a candidate: its shift with properties at their nominal values."""
+    k, shift = given.num_common, _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
+    doubts = f.doubts - healthy.doubts
+    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.jacobian[:, k:], doubts)
 
 
 def _candidate(
