@@ -244,6 +244,14 @@ def test_a_gap_below_what_matters_is_none_and_told_with_its_size():
     assert attribute(replace(gap, tolerance=np.full(n, 0.05)), heldout=False).verdict == "named"
 
 
+def test_a_gap_that_nuisances_hide_where_they_never_are_is_not_small():
+    gap = gap_of({1: 3.0})
+    gap = replace(gap, tolerance=np.full(gap.residual.size, 10.0))
+    hidden = replace(gap, residual=gap.residual + 4.0 * gap.nuisance[:, 0])
+    assert attribute(gap, heldout=False).verdict == "none"
+    assert attribute(hidden, heldout=False).verdict != "none"
+
+
 def test_a_prior_that_tolerates_is_a_prior_and_leaves_what_matters_as_likely():
     b = Background.usual()
     prior = b.tolerant(np.array([1.0, 1.5, 10.0, 1e4]))
@@ -479,6 +487,17 @@ def test_a_small_cause_beside_a_large_one_is_needed_where_the_form_of_the_large_
     speaks = both.score - fitted(f, ()).score
     assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks
     assert _needed(f, both, 2) == needed
+
+
+def test_a_cause_has_the_parameters_that_it_has_without_what_its_set_can_spare():
+    gap = gap_of({0: 60.0, 2: 2.5})
+    push = gap.candidates[2].jacobian + 0.3 * gap.candidates[0].jacobian
+    gap = replace(gap, candidates=(gap.candidates[0], linear("c", push)))
+    found, f = attribute(gap, heldout=False), forms(gap)
+    assert found.models[0].effects == (0, 1) and found.causes == ("a",)
+    alone, both = fitted(f, (0,)).x[-1], fitted(f, (0, 1)).x[1]
+    assert abs(alone - both) > 0.3
+    assert found.effects["a"].parameters["a0"].mean == pytest.approx(alone)
 
 
 def test_a_scattering_cause_gains_more_than_the_forms_of_the_others_may_feign():

@@ -1,14 +1,17 @@
 """What changes within a sample: fast work is no irregular clock, and brief delays are told with care."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from demo_recordings import RIG, TASK
 
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
+from simgap.effects.sensing import _clock_rates
 from simgap.gap.assemble import scatters
 from simgap.gap.frame import CHANNELS, _struck, build
-from simgap.gap.problem import fit, neutral, problem, residual_at
+from simgap.gap.problem import fit, neutral, problem, residual_at, residual_of
 from simgap.gap.residuals import fivepoint
 from simgap.gap.sensor_noise import changes, kinks, of_a_kink, speed_jumps
 from simgap.gap.twins import performed, recorded
@@ -47,6 +50,29 @@ def test_an_irregular_clock_has_its_own_size_though_samples_are_grouped():
     assert given.frame.groups[0] > 2
     (clock,) = scatters(given, fit(given, (), neutral(given)).residual, ["clock_jitter"])
     assert clock.same and clock.value == pytest.approx(4e-3, rel=0.3)
+
+
+@double_precision
+def test_a_clocks_errors_move_residuals_by_their_unit(fast):
+    """Monte Carlo: speeds and positions of a smooth motion, read at wrong times."""
+    given, _ = fast
+    world, there = given.frame.world, given.there
+    t, rng, sd = np.asarray(world.t), np.random.default_rng(0), 2e-3
+
+    def moved(at):  # both fingers swing, fast enough for speeds to differ between neighbours
+        swing = 0.02 * np.sin(9 * at)[..., None] * np.array([1.0, 0.7, 1.0, 0.7])
+        speed = 0.18 * np.cos(9 * at)[..., None] * np.array([1.0, 0.7, 1.0, 0.7])
+        return world._replace(joints=swing, rates=speed, jointed=np.zeros(()))
+
+    still = replace(given, frame=replace(given.frame, world=moved(t)))
+    unit = _clock_rates(still) * np.sqrt(np.array(given.frame.groups))[:, None, None]
+    drawn = [residual_of(given, moved(t + sd * rng.standard_normal(t.shape))) for _ in range(60)]
+    change = np.zeros((60, *there.shape))
+    change[:, there] = np.array(drawn) - residual_of(given, moved(t))
+    for c in (CHANNELS.index("vx"), CHANNELS.index("vy")):
+        mine = there[..., c]
+        ratio = np.sqrt(np.mean(change[:, mine, c] ** 2, axis=0)) / (sd * unit[mine, c])
+        assert np.quantile(ratio, [0.1, 0.5, 0.9]) == pytest.approx([0.87, 1.0, 1.13], abs=0.05)
 
 
 @pytest.mark.parametrize(
