@@ -20,27 +20,28 @@ LANDING = 4e-5  # prior: m; sd of a pad's slip in the shock of landing
 BEYOND = 5e-3  # prior: kg; sd of a pad's mass in front of its sensor, whose weight was tared
 
 
-def with_nuisances(given: Problem) -> Problem:
-    """Add the nuisances, linearised without effects.
+def with_nuisances(given: Problem, at: np.ndarray | None = None) -> Problem:
+    """Add the nuisances, linearised without effects `at` given coordinates, else where they were before.
 
     Their number depends only on trials, grips and rig. A column of zeros is kept, as with additional noise on
     the recordings it may not be zero (`simgap.gap.assemble`).
     """
-    columns = [
-        *_admitted(given), *_inertial(given), *_late_rates(given), *_settling(given)
-    ]  # fmt: skip
-    return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))
+    at = given.nuisances.at if at is None else at
+    columns = [*_admitted(given, at), *_inertial(given), *_late_rates(given), *_settling(given)]
+    return replace(given, nuisances=Nuisances(np.concatenate(columns, 1), at))
 
 
-def _admitted(given: Problem) -> list[np.ndarray]:
+def _admitted(given: Problem, at: np.ndarray | None) -> list[np.ndarray]:
     """Columns (n, .) of what rig.toml admits under [systematic]."""
-    out, k = [], given.num_common
+    out, k, u = [], given.num_common, neutral(given)
+    if at is not None:
+        u[:k] = at[:k]
     for slot in slots(k)[0]:
         if slot.effect.admitted is None:
             continue
         key, sds = slot.effect.admitted(given.frame.rig)
         if any(sds.values()):
-            jacobian = derivatives(given, (key,), neutral(given))[:, k:]
+            jacobian = derivatives(given, (key,), u)[:, k:]
             for j, p in enumerate(free_of(key)):
                 if sds.get(p.name, 0.0) > 0:
                     out.append(-jacobian[:, [j]] * sds[p.name] / p.sd)

@@ -263,6 +263,9 @@ def search(
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, (), neutral(given))
+    # What moves contacts also moves the moments that turn a block as easily as this one.
+    given = with_nuisances(given, healthy.u)
+    healthy = fit(given, (), healthy.u)
     fits = [best_fit(given, key, healthy, promising) for key in keys]
     others = redrawn(given) if noisy else ()
     for _ in range(ROUNDS if noisy else 0):
@@ -307,7 +310,7 @@ def _anew(
     again = recovered or realigned(aligned, given, best)
     if recovered is None and not SHIFT < moved(aligned, again) < np.inf:
         return None
-    other = with_nuisances(rebased(build(again), given))
+    other = with_nuisances(rebased(build(again), given), given.nuisances.at)
     if recovered is None and fit(other, best.effects, best.u).cost / other.size > best.cost / given.size:
         return None
     plain = fit(other, (), healthy.u)
