@@ -34,8 +34,9 @@ def with_nuisances(given: Problem, at: np.ndarray | None = None) -> Problem:
 def _admitted(given: Problem, at: np.ndarray | None) -> list[np.ndarray]:
     """Columns (n, .) of what rig.toml admits under [systematic]."""
     out, k, u = [], given.num_common, neutral(given)
-    if at is not None:
-        u[:k] = at[:k]
+    if at is not None:  # an effect may have pulled it far off
+        turning = slice(given.centre.size, k)
+        u[turning] = np.minimum(at[turning], 1.0)
     for slot in slots(k)[0]:
         if slot.effect.admitted is None:
             continue

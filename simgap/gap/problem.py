@@ -26,7 +26,7 @@ from simgap.gap.residuals import STANCES, contact, residuals
 class Nuisances:
     """Derivatives (n, Z) of whitened residuals by nuisances, in units of their prior standard deviations.
 
-    They were taken without effects, `at` coordinates (all columns) whose properties and turning count.
+    They were taken without effects, `at` coordinates (all columns) of which those of turning count.
     """
 
     columns: np.ndarray
@@ -364,14 +364,14 @@ def evaluated(
         effects: Keys of the candidate's effects.
         u: Coordinates of all parameters.
         mine: Columns (K,) to differentiate with respect to, all properties first.
-        usual: Known derivatives (n, P); those with respect to the properties an effect hardly changes.
+        usual: Known derivatives (n, P) with respect to what all fits have, which an effect hardly changes.
         at: Result of `cost_at`, if known.
     """
     at = cost_at(given, effects, u, mine) if at is None else at
     k, step, each = given.num_common, u.copy(), []
-    first = 0 if usual is None else given.centre.size
-    world = _without_effects(given, effects, u)  # what all fits have needs no further correction
-    each += [whitened(given, world, row) for row in (u + STEP * np.eye(k, u.size))[first:]]
+    if usual is None:  # what all fits have needs no further correction
+        world = _without_effects(given, effects, u)
+        each += [whitened(given, world, row) for row in u + STEP * np.eye(k, u.size)]
     for column in mine[k:]:
         step[column] += STEP
         each.append(whitened(given, _without_effects(given, effects, step), u))
@@ -379,8 +379,8 @@ def evaluated(
     z = np.array([residual[given.there] for residual, _ in each]).reshape(len(each), given.size)
     jacobian, doubt_slope = (z - at[0]).T / STEP, (np.array([doubt for _, doubt in each]) - at[1]) / STEP
     if usual is not None:
-        jacobian = np.concatenate([usual[:, :first], jacobian], 1)
-        doubt_slope = np.concatenate([np.zeros(first), doubt_slope])
+        jacobian = np.concatenate([usual, jacobian], 1)
+        doubt_slope = np.concatenate([np.zeros(k), doubt_slope])
     return Fitted(effects, u, mine, at[0], jacobian, at[1], doubt_slope, at[2])
 
 
