@@ -1,7 +1,8 @@
 """Features of recordings that are no fault, as columns fitted together with every effect.
 
-They are what rig.toml admits under [systematic], velocities that a drive computes as differences, and blocks
-that turn in the grip. Each column is in units of its prior standard deviation, so that its prior is N(0, 1).
+They are what rig.toml admits under [systematic], inertia of pads, velocities that a drive computes as
+differences, and how lifted blocks settle. Each column is in units of its prior standard deviation, so that
+its prior is N(0, 1).
 """
 
 from __future__ import annotations

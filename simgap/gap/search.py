@@ -263,7 +263,7 @@ def search(
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, (), neutral(given))
-    # What moves contacts also moves the moments that turn a block as easily as this one.
+    # What moves contacts also moves the moments that turn a block, by as much as these pads let it.
     given = with_nuisances(given, healthy.u)
     healthy = fit(given, (), healthy.u)
     fits = [best_fit(given, key, healthy, promising) for key in keys]
