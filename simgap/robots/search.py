@@ -11,7 +11,7 @@ posterior over sets.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -52,6 +52,7 @@ JOINED = " against "
 NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
+SETTLED = 0.3  # numerics: nats to which the best set is fitted in the end, as three rule others out
 NEAR_BY = 20.0  # numerics: nats of the best set within which others are fitted to the end
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
@@ -148,7 +149,9 @@ class Search:
         return self._settled(best)
 
     def _settled(self, best: FittedSet) -> FittedSet:
-        """The best set or, where that is better founded, the likeliest."""
+        """The best set, fitted to the end."""
+        if best.promise > best.score + SETTLED:
+            best = self.fit(best.names, best.point, [best.whiten])
         leading = max(self.fitted.values(), key=lambda one: one.score)
         return self._with_less(leading) if self._is_better(leading, best) else best
 
@@ -156,14 +159,14 @@ class Search:
         """A given set at its best."""
         sets, levels = self.propose(self.nothing(), self.wanted)
         _, level, begin = self._likeliest(sets, names)
-        return self._with_less(self.fit(names, begin, levels[level]))
+        return self._with_less(self.fit(names, begin, [levels[level]]))
 
     def _with_less(self, found: FittedSet) -> FittedSet:
         """A set, after all sets with one effect less are fitted, too: they judge what each effect takes."""
         for out in found.names if len(found.names) > 1 else ():
             rest = tuple(n for n in found.names if n != out)
             if frozenset(rest) not in self.fitted:
-                self.fit(rest, without(found.point, out), found.whiten)
+                self.fit(rest, without(found.point, out), [found.whiten])
         return found
 
     def nothing(self) -> FittedSet:
@@ -173,7 +176,7 @@ class Search:
             every = linearise(self.composed, point, [*self.along, *self.wanted])
             self.composed = with_wobble(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
-        return self.fit((), point, covariances(self.composed, linear).whitener())
+        return self.fit((), point, [covariances(self.composed, linear).whitener()])
 
     def _from(self, best: FittedSet, tell: Progress) -> FittedSet:
         """The best set that steps lead to."""
@@ -182,7 +185,27 @@ class Search:
             better = self._find_better(best, best) or self._exchange(best)
             if better is None:
                 break
-            best = better
+            best = better if number else self._from_other_ends(better)
+        return best
+
+    def _from_other_ends(self, best: FittedSet) -> FittedSet:
+        """The same set from the other end of how the simulator takes its commands, where that promises more.
+
+        Commands held in steps are nearly commands in lines that come later, and no small step leads from one
+        to the other.
+        """
+        effects = self.composed.effects
+        for name in (n for n in self.along if effects[n].numeric and not effects[n].dear):
+            for short, p in effects[name].parameters.items():
+                if np.isfinite([p.low, p.high]).all():
+                    near_low = best.point[name][short] < 0.5 * (p.low + p.high)
+                    other = {**best.point[name], short: p.high if near_low else p.low}
+                    point = {**best.point, name: other}
+                    there = replace(best, composed=best.composed.moved(point), point=point)
+                    sets, levels = self.propose(there, best.names)
+                    score, k, begin = self._likeliest(sets, best.names)
+                    if score > best.score + NEAR:
+                        best = self.fit(best.names, begin, [levels[k]], best.score)
         return best
 
     def _from_calibration(self) -> FittedSet | None:
@@ -194,10 +217,10 @@ class Search:
             return None
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
-        whole = self.fit(names, begin, self.fitted[frozenset()].covariances.whitener())
+        whole = self.fit(names, begin, [self.fitted[frozenset()].covariances.whitener()])
         sets, _ = self.propose(whole, names)
         names = sets.pruned(names, self._likeliest(sets, names)[1])
-        return self.fit(names, self._likeliest(sets, names)[2], whole.whiten)
+        return self.fit(names, self._likeliest(sets, names)[2], [whole.whiten])
 
     def _is_moved(self, name: str, values: Mapping[str, float]) -> bool:
         parameters = self.composed.effects[name].parameters
@@ -208,31 +231,38 @@ class Search:
         score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(sets.gram)))
         return score, level, point_of(self.composed.effects, sets.fit(names, level), names, self.along)
 
-    def fit(self, names: Names, begin: Point, whiten: Whitener, rival: float = -np.inf) -> FittedSet:
+    def fit(
+        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
+    ) -> FittedSet:
         """Fit a set exactly, and remember it at its best.
 
         Args:
             names: The set.
             begin: Where the fit begins.
-            whiten: Whitener of the first fit. Later fits are whitened by what the set leaves itself, and run
+            scales: Whiteners of the first fit. Later fits are whitened by what the set leaves itself, and run
                 from where it puts the starts, as long as the closed form promises more, or is wrong along the
-                starts of a leading set.
+                starts of a leading set. A fit that stays behind the rival is begun anew with the next scale.
             rival: Log evidence [nats] of the set to beat.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
-        here, key = self.composed.moved(begin), frozenset(names)
-        one = self._judge(here, names, fit_effects(here, linearise(here, begin, [], {}), whiten, begin))
-        for _ in range(AGAIN):
-            before, (there, bend) = one.score, self._begun_anew(one)
-            leading = max((known.score for known in self.fitted.values()), default=before)
-            bent = bend > BETTER and before + bend > leading - NEAR_BY
-            if not bent and one.promise < max(before + BETTER, rival - NEAR):
+        here, best, key = self.composed.moved(begin), None, frozenset(names)
+        for whiten in scales:
+            one = self._judge(here, names, self._fit_point(here, begin, whiten))
+            for _ in range(AGAIN):
+                before, (there, bend) = one.score, self._begun_anew(one)
+                leading = max((known.score for known in self.fitted.values()), default=before)
+                bent = bend > BETTER and before + bend > leading - NEAR_BY
+                if not bent and one.promise < max(before + BETTER, rival - NEAR):
+                    break
+                one = max((one, self._fit_again(there, one)), key=lambda fitted: fitted.score)
+                if one.score < before + BETTER:
+                    break
+            best = one if best is None or one.score > best.score else best
+            if best.score >= rival - NEAR:
                 break
-            one = max((one, self._fit_again(there, one)), key=lambda fitted: fitted.score)
-            if one.score < before + BETTER:
-                break
-        if key not in self.fitted or self.fitted[key].score < one.score:
-            self.fitted[key] = one
+        assert best is not None
+        if key not in self.fitted or self.fitted[key].score < best.score:
+            self.fitted[key] = best
         return self.fitted[key]
 
     def _begun_anew(self, one: FittedSet) -> tuple[Composed, float]:
@@ -247,6 +277,9 @@ class Search:
         there = composed.run_aside(asides)
         off = linearise(there, one.point, [], linear.starts).residual - linear.residual
         return there.moved(one.point), 0.5 * float(np.sum(one.whiten(np.nan_to_num(off)) ** 2))
+
+    def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
+        return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)
 
     def _fit_again(self, composed: Composed, one: FittedSet) -> FittedSet:
         """A set fitted further, whitened by what it leaves and by how errors of starts grow from there."""
@@ -425,8 +458,8 @@ class Search:
             names = self._take_apart(near[k], begin)
             if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                 continue
-            rival = -np.inf if learns else best.score
-            one, tried = self.fit(names, begin, levels[level[k]], rival), tried + 1
+            scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
+            one, tried = self.fit(names, begin, scales, -np.inf if learns else best.score), tried + 1
             wrong = max(wrong, one.score - best.score - promised[k])
             if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
                 least = max(least, -NEAR - wrong)
@@ -479,7 +512,7 @@ class Search:
         """A better set without one of the best's causes, or with replacements for one."""
         for out in best.names:
             rest = tuple(n for n in best.names if n != out)
-            less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), best.whiten)
+            less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), [best.whiten])
             there = less if self._is_better(less, best) else self._find_better(less, best)
             if there is not None:
                 return there

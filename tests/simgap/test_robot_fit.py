@@ -55,9 +55,9 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
 def test_what_is_settled_stays(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing = search.nothing()
-    first = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, nothing.whiten)
+    first = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
     assert first.score > nothing.score + 100
-    again = search.fit(("viscous",), first.point, first.whiten)
+    again = search.fit(("viscous",), first.point, [first.whiten])
     assert abs(again.score - first.score) < BETTER
 
 
@@ -100,7 +100,7 @@ def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
     sets, levels = search.propose(none, names)
     hidden = float(sets.scores([names[:1]], 0)[0] - sets.scores([()], 0)[0])
     large, small, both = (
-        search.fit(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, levels[-1])
+        search.fit(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, [levels[-1]])
         for one in (names[:1], names[1:], names)
     )
     assert large.score - none.score > 1.5 * hidden > 30
