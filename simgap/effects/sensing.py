@@ -291,9 +291,9 @@ def _clock_rates(given) -> np.ndarray:
     for k, c in enumerate((CHANNELS.index("vx"), CHANNELS.index("vy"))):
         # By the errors of the clock at three samples: the mean (1, 4, 1) / 6 of speeds read at wrong times
         # minus the central difference of positions read at them.
-        at = rate[..., k] / 6, speed[..., k] / (2 * step)
-        before, now, after = at[0][:, :-2] + at[1][:, :-2], 4 * at[0][:, 1:-1], at[0][:, 2:] - at[1][:, 2:]
-        out[:, 1:-1, c] = np.sqrt(before**2 + now**2 + after**2)
+        of_speed, of_place = rate[..., k] / 6, speed[..., k] / (2 * step)
+        before, after = (of_speed + of_place)[:, :-2], (of_speed - of_place)[:, 2:]
+        out[:, 1:-1, c] = np.sqrt(before**2 + np.square(4 * of_speed[:, 1:-1]) + after**2)
     return out * given.weight / np.sqrt(np.array(given.frame.groups))[:, None, None]
 
 

@@ -40,12 +40,16 @@ OBJECT_INERTIA = HandEffect(
 
 
 def _apply_offcentre_mass(performance: Performance, values, rng) -> Performance:
-    """Fingers that stay where they are shear their pads as the block turns between them."""
+    """Fingers that stay where they are shear their pads as the block turns between them, by the pads'
+    usual compliance (the balance of moments of `simgap.gap.residuals.turned`)."""
     pad, width, force = performance.rig.fingertip, performance.width, flat(performance)
     give = 1 / pad.shear_stiffness
     apart = performance.position[:, 1, 1] - performance.position[:, 0, 1] - give * (force[:, 3] - force[:, 1])
-    moment = (force[:, 0] - force[:, 2]) / 2 * apart + (force[:, 3] - force[:, 1]) * width / 2
-    yields = width**2 / (width**2 + 2 * give / turning_compliance(pad.normal_stiffness))
+    grip = (force[:, 0] - force[:, 2]) / 2
+    moment = grip * apart + (force[:, 3] - force[:, 1]) * width / 2
+    # A grip pushes a turned block on, the pads' turning and shear hold it back.
+    resists = 1 / turning_compliance(pad.normal_stiffness) - grip * width
+    yields = width**2 / (width**2 + 2 * give * resists)
     more = np.where(performance.carried > 0, yields * (performance.carried * values["offset"] - moment), 0.0)
     return with_force(performance, force + (more / width)[:, None] * np.array([0.0, -1.0, 0.0, 1.0]))
 
@@ -58,7 +62,7 @@ OFFCENTRE_MASS = HandEffect(
     mistaken_for=("force_crosstalk", "force_bias"),
     called="a block heavier on one side",
     check="Balance the block on an edge under its middle.",
-    parameters={"offset": Parameter(0.0, 0.003, "m", low=-0.01, high=0.01)},  # within a usual block
+    parameters={"offset": Parameter(0.0, 0.003, "m", low=-0.01, high=0.01)},  # physics: within the block
     stage=CONTACT,
     correct=lambda w, v, on: w._replace(couple=w.couple + v["offset"]),
     apply=_apply_offcentre_mass,

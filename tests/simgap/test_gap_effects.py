@@ -7,7 +7,7 @@ from jax.tree_util import tree_leaves
 from hmmseg.hand.kinematics import inverse
 from hmmseg.io.rig import Finger, Fingertip, Rig
 from simgap.effects import catalogue
-from simgap.effects.base import Performance, World, flat, tips
+from simgap.effects.base import Performance, World, flat, tips, turning_compliance
 from simgap.gap.problem import STEP
 from simgap.gap.residuals import contact
 
@@ -102,6 +102,24 @@ def test_what_apply_puts_in_correct_takes_out(name):
     assert before > 0.01
     tolerance = 0.15 * before if name == "fingertip_mass" else 0.05 * before  # accelerations are differences
     np.testing.assert_allclose(contact(out), world_of(truth).force, atol=tolerance)
+
+
+def test_a_mass_off_the_middle_turns_the_block_until_moments_balance():
+    truth, off = performance(), 0.004
+    out = catalogue()["offcentre_mass"].apply(truth, {"offset": off}, np.random.default_rng(0))
+    pad, force, up = truth.rig.fingertip, out.force, truth.carried > 0
+    np.testing.assert_array_equal(out.position, truth.position)
+    np.testing.assert_array_equal(force[~up], truth.force[~up])
+    np.testing.assert_allclose(force.sum(1), truth.force.sum(1), atol=1e-12)
+    sheared = (force - truth.force)[:, 1, 1] - (force - truth.force)[:, 0, 1]
+    turn = -sheared / pad.shear_stiffness / truth.width  # tips stay: what pads shear more, the block turns
+    apart = out.position[:, 1, 1] - out.position[:, 0, 1]
+    apart = apart - (force[:, 1, 1] - force[:, 0, 1]) / pad.shear_stiffness
+    moment = (force[:, 0, 0] - force[:, 1, 0]) / 2 * apart
+    moment = moment + truth.width / 2 * (force[:, 1, 1] - force[:, 0, 1]) - truth.carried * off
+    expected = turning_compliance(pad.normal_stiffness) * moment
+    assert np.abs(turn[up]).max() > 1e-3
+    np.testing.assert_allclose(turn[up], expected[up], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
