@@ -26,7 +26,7 @@ from simgap.effects.base import (
     tips,
 )
 from simgap.effects.filters import faded, lowpass
-from simgap.gap.frame import CHANNELS, Arrays
+from simgap.gap.frame import CHANNELS, OFFSET, Arrays
 from simgap.phases import Phase
 
 # Forces between two samples: their interpolation, their slopes, and the uncertainty of both.
@@ -319,7 +319,7 @@ def residuals(
 
     pads_give = Pads(n1, n2, s1, s2)
     apart = block_offset(y2 - y1, fy1, fy2, pads_give)
-    turn, tipped = turned(world, weight, width, turning, force, apart)
+    turn, tipped, ease = turned(world, weight, width, turning, force, apart)
     # Grips at unequal heights are nearer to each other on a block that turns towards the lower one.
     sine = np.sin(turn)
     gap = x2 - x1 - width + sine * (apart - width * sine / 2)
@@ -347,10 +347,15 @@ def residuals(
     there = arrays.there[..., :4]
     weight_of = np.stack([still, closed * world.ground, held, closed * held], -1) * there
     sd = np.sqrt(np.square(noise[..., :4]) + _doubt(world, firm))
+    wider = _misread_moment(world, arrays, width, ease, force, sd[..., OFFSET])
+    sd[..., OFFSET] *= wider
     geometry, loose, unseen = in_grip(
         np.stack([x, y, distance, offset], -1) + world.off, weight_of, sd, firm, world, arrays
     )
     factor = loose * np.square(sd / noise[..., :4])
+    # True moments are unknown one by one: their likeliest values leave the misfit over its variance, without
+    # the variance's logarithm (total least squares).
+    unseen -= float(np.log(wider[there[..., OFFSET] > 0]).sum())
 
     acceleration, _ = fivepoint(world, velocity)
     ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))
@@ -381,8 +386,9 @@ def residuals(
 def turned(
     world: World, weight: np.ndarray, width: np.ndarray, turning: np.ndarray, force: np.ndarray,
     apart: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Angle (T, N) [rad] by which a block turns in the grip to the left, and how far (T, N) [m] it rises.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Angle (T, N) [rad] by which a block turns in the grip to the left, how far (T, N) [m] it rises, and how
+    easily (T, N) [rad/(N m)] it turns on.
 
     Balance of moments about the block's middle: shears of the fingers, the couple of grips at unequal heights
     and a mass off the middle turn a block against the pads unless its support holds it upright. The load of
@@ -399,12 +405,31 @@ def turned(
     grip, shear = (force[..., k] - force[..., 2 + k] for k in (0, 1))
     moment = grip / 2 * apart - shear * width / 2 - weight * world.couple * world.carry
     load = np.maximum(weight - force[..., 1] - force[..., 3], 0.0) * (1 - world.carry)
-    turn, rise = np.zeros_like(weight), np.zeros_like(weight)
+    turn, rise, ease = np.zeros_like(weight), np.zeros_like(weight), np.zeros_like(weight)
     for share, compliance in zip(STANCES, turning, strict=True):
         stance = share * width / 2
-        by = compliance * np.sign(moment) * np.maximum(np.abs(moment) - load * stance, 0.0)
+        beyond = np.maximum(np.abs(moment) - load * stance, 0.0)
+        by = compliance * np.sign(moment) * beyond
         turn, rise = turn + by, rise + stance * np.abs(by) * (1 - world.carry)
-    return turn, rise
+        ease = ease + compliance * (beyond > 0)
+    return turn, rise, ease
+
+
+def _misread_moment(
+    world: World, arrays: Arrays, width: np.ndarray, ease: np.ndarray, force: np.ndarray, sd: np.ndarray
+) -> np.ndarray:
+    """Standard deviation (T, N) of the offset with the noise of the moment that turns the block, over `sd`
+    without it.
+
+    The offset's own noise enters twice: grips at unequal heights turn the block, which takes some of it back.
+    """
+    shear = 2 * arrays.plain[..., CHANNELS.index("shear")]  # of the difference of both fingers' forces
+    give = np.mean(world.give_shear)
+    of_place = np.maximum(np.square(arrays.plain[..., OFFSET]) - np.square(give * shear), 0.0)
+    left = 1 - width * ease * (force[..., 0] - force[..., 2]) / 2
+    of_force = np.square((give * left + np.square(width) * ease / 2) * shear)
+    more = np.square(left) * of_place + of_force - np.square(arrays.plain[..., OFFSET])
+    return np.sqrt(1 + more / np.square(sd))
 
 
 def _doubt(world: World, firm: np.ndarray) -> np.ndarray:
