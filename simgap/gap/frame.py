@@ -276,19 +276,20 @@ def _one_finger(
     boundaries: np.ndarray,
     sd: np.ndarray,
 ) -> np.ndarray:
-    """Samples (N,) of free motion next to a grip at which only one finger touches.
+    """Samples (N,) of free motion next to a grip at which only one finger touches, or one presses harder.
 
-    Such a touch, of the block or of its support, is a contact that the task does not list, and no gap. One
-    finger's force departs from its median in that free motion, the other's does not; `sd` (N,) is the noise
-    of a force [N].
+    Such a touch, of the block or of its support, is a contact that the task does not list, and no gap: what
+    the support's friction holds need not balance. One finger's force departs from its median in that free
+    motion and the other's does not, or not against it; `sd` (N,) is the noise of a force [N].
     """
     out = np.zeros(t.size, bool)
     for s in np.unique(subtask[free]):
         mine = np.flatnonzero(subtask == s)
         change = force[mine] - np.median(force[mine], axis=0)
         touches = np.abs(change.reshape(-1, 2, 2)).max(axis=2) > SURE * sd[mine, None]
+        unequal = np.abs(change[:, 0] + change[:, 2]) > SURE * np.sqrt(2.0) * sd[mine]
         near = (np.abs(t[mine, None] - boundaries) < FIRST_TOUCH).any(axis=1)
-        out[mine] = near & (touches[:, 0] != touches[:, 1])
+        out[mine] = near & ((touches[:, 0] != touches[:, 1]) | unequal)
     return out
 
 
