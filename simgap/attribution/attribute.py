@@ -364,8 +364,8 @@ def _examined(
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     """Drop causes without which held-out trials are predicted no worse, one at a time.
 
-    The trial that gains most does not count: an accident of one trial is no cause. A random effect must gain
-    more than errors in the forms of the others may imitate.
+    The trial that gains most does not count: an accident of one trial is no cause. What residuals say for a
+    random effect must be more than errors in the forms of the others may imitate.
     """
     of = others.whole.gap.candidates
     while causes:
@@ -375,8 +375,11 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
             gains = others.gains(causes, rest, rest)
             gained[j] = float(gains.sum() - gains[:-1].max())
             if rest and not of[j].parameters:
-                feigned = max(of[i].form for i in rest) * others.gain(rest, ())
-                gained[j] -= feigned if gains.sum() < feigned else 0.0
+                feigned, shown = (
+                    max(of[i].form for i in rest) * others.gain(rest, ()),
+                    gains.sum() - of[j].evidence,
+                )
+                gained[j] -= max(shown, 0.0) if shown < feigned else 0.0
         least = min(gained, key=lambda j: gained[j])
         if gained[least] > POSITIVE:
             break

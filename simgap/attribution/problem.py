@@ -95,6 +95,7 @@ class Candidate:
         hidden: Parameters that differ from part to part, such as the phase of an oscillation.
         size: What relative errors (k,) of parameters refer to; their deviation from neutral if None or NaN.
         frees: Most additional variance (n,) of each cosine coefficient, in units of the noise's, if it acts.
+        beside: Effects that acted where it was linearised; one without is listed before.
     """
 
     name: str
@@ -112,6 +113,12 @@ class Candidate:
     hidden: tuple[str, ...] = ()
     size: Float[np.ndarray, " k"] | None = None
     frees: np.ndarray | None = None
+    beside: tuple[str, ...] = ()
+
+    @property
+    def form_of(self) -> tuple[str, tuple[str, ...]]:
+        """Name and parameters, which identify it wherever it was linearised."""
+        return self.name, self.parameters
 
     def taken(self, rows: np.ndarray) -> Candidate:
         """The candidate on some rows (a mask or indices)."""

@@ -5,7 +5,7 @@ Sets within a window of the best are kept (Occam's window: Madigan & Raftery, JA
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,8 +32,7 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
     """Find the sets of effects within a window of the best.
 
     The neighbours of a set are screened from its mode in one step, the leading ones refined in a few, and
-    what leads then is fitted until it converges. Of a set whose effects were linearised at several points the
-    best counts.
+    what leads then is fitted until it converges.
 
     Args:
         f: Quadratic forms of the gap.
@@ -43,7 +42,7 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
         The sets, best first; the empty set is always one of them.
     """
     seen: dict[tuple[int, ...], Model] = {(): fitted(f, ())}
-    seen |= {(j,): fitted(f, (j,)) for j in range(len(f.gap.candidates))}
+    seen |= {(j,): fitted(f, (j,)) for j, c in enumerate(f.gap.candidates) if not c.beside}
     rough: set[tuple[int, ...]] = set()
     opened: set[tuple[int, ...]] = {()}
     # The effect that leaves the least squares may be the larger of two causes although others score higher as
@@ -66,25 +65,34 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
             first = sorted(found, key=lambda m: -m.score)[:REFINED]
             seen |= {m.effects: fitted(f, m.effects) for m in first}
             rough |= {*new} - {*seen}
-    best, of = max(m.score for m in seen.values()), f.gap.candidates
-    kept: dict[tuple, Model] = {}
-    for m in sorted(seen.values(), key=lambda m: -m.score):
-        if m.score > best - WINDOW or not m.effects:
-            kept.setdefault(tuple(sorted((of[j].name, of[j].parameters) for j in m.effects)), m)
-    return list(kept.values())
+    best = max(m.score for m in seen.values())
+    kept = [m for m in seen.values() if m.score > best - WINDOW or not m.effects]
+    return sorted(kept, key=lambda m: -m.score)
 
 
 def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
     """Sets with one effect added, removed or exchanged; only one form of an effect acts."""
-    names = [c.name for c in f.gap.candidates]
-    fewer = [tuple(j for j in effects if j != out) for out in effects]
+    of = f.gap.candidates
+    forms = [j for j, c in enumerate(of) if not c.beside]
+    mine = [next(j for j in forms if of[j].form_of == of[i].form_of) for i in effects]
+    fewer = [[j for j in mine if j != out] for out in mine]
     more = [
-        tuple(sorted({*e, j}))
-        for e in (effects, *fewer)
-        for j in range(len(names))
-        if j not in effects and names[j] not in {names[i] for i in e}
+        [*e, j]
+        for e in (mine, *fewer)
+        for j in forms
+        if j not in mine and of[j].name not in {of[i].name for i in e}
     ]
-    return list(dict.fromkeys([*more, *fewer]))
+    return list(dict.fromkeys(_linearised(f, e) for e in (*more, *fewer)))
+
+
+def _linearised(f: Forms, effects: Sequence[int]) -> tuple[int, ...]:
+    """The same forms of effects, each as linearised beside the most of the others and the fewest besides."""
+    of, out = f.gap.candidates, []
+    names = {of[j].name for j in effects}
+    for j in effects:
+        same = [i for i, c in enumerate(of) if c.form_of == of[j].form_of]
+        out.append(max(same, key=lambda i: (len({*of[i].beside} & names), -len({*of[i].beside} - names))))
+    return tuple(sorted(out))
 
 
 def weights(models: list[Model]) -> np.ndarray:

@@ -212,7 +212,7 @@ def redrawn(given: Problem) -> tuple[Problem, ...]:
 
     Every number is shifted by its sensor's standard deviation, up or down. Signs of neighbouring samples and
     of neighbouring channels are orthogonal over the draws, so that squares of their combinations have their
-    expectation without scatter. If forces were rounded, a last draw is without the errors that they show.
+    expectation without scatter.
     """
     world, sensor = given.frame.world, given.frame.arrays.sensor
     place = (np.arange(world.t.shape[1])[:, None] + np.arange(4)) % len(SIGNS)
@@ -222,7 +222,6 @@ def redrawn(given: Problem) -> tuple[Problem, ...]:
         for k, name in enumerate(("joints", "rates", "force"))
     }
     draws = [{n: signs[place] * each for n, each in noise.items()} for signs in SIGNS.T]
-    draws += [{"force": -given.frame.rounding_errors}] if given.frame.step else []
     out = []
     for draw in draws:
         for size in SIZES:
@@ -242,23 +241,16 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
         on: Gives the columns on one of them.
     """
     out = []
-    for k, pair in enumerate(zip(others[::2], others[1::2], strict=True)):
+    for pair in zip(others[::2], others[1::2], strict=True):
         one, other = ((on(each) - columns) / size for each, size in zip(pair, SIZES, strict=True))
         alike = np.abs(one - other) <= ALIKE * np.maximum(np.abs(one), np.abs(other))
-        usual = 1 / np.sqrt(len(SIGNS.T)) if k < len(SIGNS.T) else 1.0
-        out.append(np.where(alike, usual * (one + other) / 2, 0.0).astype(np.float32))
+        out.append(np.where(alike, (one + other) / np.sqrt(4 * len(SIGNS.T)), 0.0).astype(np.float32))
     return np.stack(out)
 
 
 def _spectra(rows: Rows, noise: np.ndarray) -> np.ndarray:
-    """Spectra of the errors of `carried`, over the noise's standard deviation.
-
-    Sensor noise was redrawn white, of the stated size; rounding is as it was.
-    """
-    out = np.empty_like(noise)
-    for k, draw in enumerate(noise):
-        out[k] = cosines(rows, draw.astype(float), rows.shape if k < len(SIGNS.T) else None)[0]
-    return out
+    """Spectra of the errors of `carried`, over the standard deviation of white noise of the stated size."""
+    return np.stack([cosines(rows, draw.astype(float), rows.shape)[0] for draw in noise]).astype(np.float32)
 
 
 def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitted:
@@ -373,19 +365,18 @@ def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
     k = given.num_common
     # The shift by all of them.
     all_of_them = healthy.residual - joint.residual - healthy.jacobian @ (healthy.u[:k] - joint.u[:k])
-    alone = []
-    for key in joint.effects:
+    alone, others = [], [tuple(e for e in joint.effects if e != key) for key in joint.effects]
+    for key, rest in zip(joint.effects, others, strict=True):
         u = joint.u.copy()
         own = columns_of(given, (key,))[k:]
         u[own] = neutral(given)[own]
-        rest = tuple(e for e in joint.effects if e != key)
         alone.append(residual_at(given, rest, u)[given.there] - joint.residual)
     both, doubts = (all_of_them - sum(alone)) / len(alone), (joint.doubts - healthy.doubts) / len(alone)
     out, at = [], k
-    for key, shift in zip(joint.effects, alone, strict=True):
+    for key, rest, shift in zip(joint.effects, others, alone, strict=True):
         free = free_of(key)
         out.append(_candidate(given, key, joint.columns[at : at + len(free)], joint.u, shift + both,
-                              joint.jacobian[:, at : at + len(free)], doubts))  # fmt: skip
+                              joint.jacobian[:, at : at + len(free)], doubts, rest))  # fmt: skip
         at += len(free)
     return out
 
@@ -406,7 +397,7 @@ def after(
             by_first = one.shift + one.jacobian @ (f.u[first.columns[problem.num_common :]] - one.at)
             mine = slice(first.columns.size, None)
             own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - by_first,
-                                  f.jacobian[:, mine], f.doubts - first.doubts))  # fmt: skip
+                                  f.jacobian[:, mine], f.doubts - first.doubts, f.effects[:-1]))  # fmt: skip
         return replace(gap, candidates=(*gap.candidates, *own))
 
     def on(other: Problem) -> Gap:
@@ -464,8 +455,12 @@ def _candidate(
     shift: np.ndarray,
     jacobian: np.ndarray,
     doubts: float,
+    beside: Sequence[str] = (),
 ) -> Candidate:
-    """One form of an effect as a candidate, linearised at coordinates u; `own` are its columns among them."""
+    """One form of an effect as a candidate, linearised at coordinates u `beside` effects of other keys.
+
+    `own` are its columns among the coordinates.
+    """
     free, effect = free_of(key), catalogue()[name_of(key)]
     low, high = (edge[own] for edge in limits(given))
     turned = sum(float(p.value(u[c])) for p, c in zip(free, own, strict=True) if p.name == effect.turns)
@@ -477,6 +472,7 @@ def _candidate(
         hidden=tuple(p.name for p in free if p.hidden or p.shape),
         size=np.array([1 / p.sd if p.log else np.nan for p in free]),
         frees=_turning(given, turned) if effect.turns else None,
+        beside=tuple(name_of(k) for k in beside),
     )  # fmt: skip
 
 

@@ -28,7 +28,9 @@ def with_nuisances(given: Problem, at: np.ndarray | None = None) -> Problem:
     the recordings it may not be zero (`simgap.gap.assemble`).
     """
     at = given.nuisances.at if at is None else at
-    columns = [*_admitted(given, at), *_inertial(given), *_late_rates(given), *_settling(given)]
+    columns = [
+        *_admitted(given, at), *_inertial(given), *_late_rates(given), *_settling(given), *_rounding(given),
+    ]  # fmt: skip
     return replace(given, nuisances=Nuisances(np.concatenate(columns, 1), at))
 
 
@@ -117,6 +119,19 @@ def _settling(given: Problem) -> list[np.ndarray]:
             out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., Phase.CARRY]}))
             for name, share in (("y", 0.5**0.5), ("offset", 2**0.5)):
                 out.append(_column(given, {name: share * LANDING * mine * arrays.phase[..., Phase.PLACE]}))
+    return out
+
+
+def _rounding(given: Problem) -> list[np.ndarray]:
+    """Columns (n, 1) of rounding errors that all trials share: equal loads are rounded alike."""
+    world, arrays, out = given.frame.world, given.frame.arrays, []
+    size, held = given.frame.step / np.sqrt(12), world.ground + world.carry
+    for o in range(arrays.objects.shape[1]) if size else ():
+        mine = held * (arrays.onehot @ arrays.objects[:, o])
+        for k in range(4):
+            force = world.force + size * mine[..., None] * np.eye(4)[k]
+            change = residual_of(given, world._replace(force=force)) - residual_of(given, world)
+            out.append(-change[:, None])
     return out
 
 

@@ -160,9 +160,7 @@ def problem(
             if prop in given:
                 value, own = given[prop]
                 usual = MEASURED[k] * (value if prop == "weight" else 1.0)
-                # Two fingers that carry the same load are rounded alike, in every trial.
-                rounded = 2 * frame.step / np.sqrt(12) if prop == "weight" else 0.0
-                centre[o, k], sd[o, k] = value, np.sqrt(own**2 + usual**2 + rounded**2)
+                centre[o, k], sd[o, k] = value, np.sqrt(own**2 + usual**2)
                 measured[o, k] = True
     return _bare(frame, centre, sd, measured)
 
