@@ -86,12 +86,12 @@ def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
 
 
 def _linearised(f: Forms, effects: Sequence[int]) -> tuple[int, ...]:
-    """The same forms of effects, each as linearised beside the most of the others and the fewest besides."""
+    """The same forms of effects, each as linearised beside those that are most like the rest of the set."""
     of, out = f.gap.candidates, []
-    names = {of[j].name for j in effects}
     for j in effects:
+        rest = {of[i].name for i in effects} - {of[j].name}
         same = [i for i, c in enumerate(of) if c.form_of == of[j].form_of]
-        out.append(max(same, key=lambda i: (len({*of[i].beside} & names), -len({*of[i].beside} - names))))
+        out.append(min(same, key=lambda i: len({*of[i].beside} ^ rest)))
     return tuple(sorted(out))
 
 

@@ -212,7 +212,7 @@ def redrawn(given: Problem) -> tuple[Problem, ...]:
 
     Every number is shifted by its sensor's standard deviation, up or down. Signs of neighbouring samples and
     of neighbouring channels are orthogonal over the draws, so that squares of their combinations have their
-    expectation without scatter.
+    expectation without scatter. If forces were rounded, a last draw is without the errors that they show.
     """
     world, sensor = given.frame.world, given.frame.arrays.sensor
     place = (np.arange(world.t.shape[1])[:, None] + np.arange(4)) % len(SIGNS)
@@ -222,6 +222,7 @@ def redrawn(given: Problem) -> tuple[Problem, ...]:
         for k, name in enumerate(("joints", "rates", "force"))
     }
     draws = [{n: signs[place] * each for n, each in noise.items()} for signs in SIGNS.T]
+    draws += [{"force": -given.frame.rounding_errors}] if given.frame.step else []
     out = []
     for draw in draws:
         for size in SIZES:
@@ -241,16 +242,23 @@ def carried(columns: np.ndarray, others: Sequence[Other], on: Callable[[Other], 
         on: Gives the columns on one of them.
     """
     out = []
-    for pair in zip(others[::2], others[1::2], strict=True):
+    for k, pair in enumerate(zip(others[::2], others[1::2], strict=True)):
         one, other = ((on(each) - columns) / size for each, size in zip(pair, SIZES, strict=True))
         alike = np.abs(one - other) <= ALIKE * np.maximum(np.abs(one), np.abs(other))
-        out.append(np.where(alike, (one + other) / np.sqrt(4 * len(SIGNS.T)), 0.0).astype(np.float32))
+        usual = 1 / np.sqrt(len(SIGNS.T)) if k < len(SIGNS.T) else 1.0
+        out.append(np.where(alike, usual * (one + other) / 2, 0.0).astype(np.float32))
     return np.stack(out)
 
 
 def _spectra(rows: Rows, noise: np.ndarray) -> np.ndarray:
-    """Spectra of the errors of `carried`, over the standard deviation of white noise of the stated size."""
-    return np.stack([cosines(rows, draw.astype(float), rows.shape)[0] for draw in noise]).astype(np.float32)
+    """Spectra of the errors of `carried`, over the noise's standard deviation.
+
+    Sensor noise was redrawn white, of the stated size; rounding is as it was.
+    """
+    out = np.empty_like(noise)
+    for k, draw in enumerate(noise):
+        out[k] = cosines(rows, draw.astype(float), rows.shape if k < len(SIGNS.T) else None)[0]
+    return out
 
 
 def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitted:

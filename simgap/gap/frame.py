@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -405,7 +406,6 @@ class Frame:
         arrays: Constants of the contact equations.
         lengths: Number of samples of each trial, padding left out.
         forces: Each trial's forces (N, 4) as recorded [N].
-        step: The step [N] to which these were rounded; 0 if they were not. The world's are smoother.
         groups: Number of recorded samples averaged into one.
     """
 
@@ -417,13 +417,26 @@ class Frame:
     arrays: Arrays
     lengths: tuple[int, ...]
     forces: tuple[np.ndarray, ...]
-    step: float
     groups: tuple[int, ...]
 
     @property
     def num_trials(self) -> int:
         """Number of trials."""
         return len(self.files)
+
+    @cached_property
+    def step(self) -> float:
+        """The step [N] to which forces were rounded; 0 if they were not."""
+        return rounding_step(self.forces)
+
+    @property
+    def rounding_errors(self) -> np.ndarray:
+        """The errors (T, N, 4) [N] from rounding that the forces themselves show."""
+        out = np.zeros_like(self.world.force)
+        for r, (force, group) in enumerate(zip(self.forces, self.groups, strict=True)):
+            error = grouped(rounding_error(force, self.step), group)[0]
+            out[r, : len(error)] = error
+        return out
 
 
 def build(aligned: AlignedTrials) -> Frame:
@@ -437,11 +450,7 @@ def build(aligned: AlignedTrials) -> Frame:
     if not chosen:
         raise ValueError("no trial fits its task")
     trials = [a.trial for a in chosen]
-    forces = tuple(np.stack([t.channels[c] for c in FORCE_CHANNELS], 1) for t in trials)
-    step = rounding_step(forces)
-    if step:
-        trials = [_unrounded(t, force, step) for t, force in zip(trials, forces, strict=True)]
-    rows = [trial_arrays(t, boundary_quantiles(a), steps, rig) for t, a in zip(trials, chosen, strict=True)]
+    rows = [trial_arrays(a.trial, boundary_quantiles(a), steps, rig) for a in chosen]
     length = max(r["t"].size for r in rows)
     stack = {key: _stacked([r[key] for r in rows], length) for key in rows[0] if key != "events"}
     events = np.stack([r["events"] for r in rows])
@@ -471,16 +480,9 @@ def build(aligned: AlignedTrials) -> Frame:
         _world(stack, events, rig),
         arrays,
         lengths,
-        forces,
-        step,
+        tuple(np.stack([t.channels[c] for c in FORCE_CHANNELS], 1) for t in trials),
         tuple(group_size(t.rate, MAX_RATE) for t in trials),
     )
-
-
-def _unrounded(trial: Trial, force: np.ndarray, step: float) -> Trial:
-    """The trial without the errors that its forces (N, 4), rounded to a step [N], show."""
-    smooth = force - rounding_error(force, step)
-    return replace(trial, channels=trial.channels | dict(zip(FORCE_CHANNELS, smooth.T, strict=True)))
 
 
 def _others(number: np.ndarray) -> np.ndarray:

@@ -11,7 +11,16 @@ from simgap.attribution.attribute import _examined, _needed, _predicting, attrib
 from simgap.attribution.heldout import RESPONSE, Heldout, scatter_between
 from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import MODELLED, Candidate, Gap, Rows, cosines
-from simgap.attribution.search import Detection, detected, leniently, sought, statistic, weights
+from simgap.attribution.search import (
+    Detection,
+    _linearised,
+    _neighbours,
+    detected,
+    leniently,
+    sought,
+    statistic,
+    weights,
+)
 from simgap.attribution.verdict import (
     ALARM,
     RECORD,
@@ -553,3 +562,26 @@ def test_causes_and_what_takes_their_place(sets, more, causes, others):
     told = conclude(sets, **{"p_value": SURE} | more)
     assert (told.causes, told.indistinguishable) == (causes, others)
     assert told.verdict == ("set" if others else "named")
+
+
+def test_an_effect_is_taken_as_linearised_beside_those_that_it_acts_with():
+    gap = gap_of({0: 3.0, 1: 2.0})
+    a, b, c, d = gap.candidates
+    after_a, joint = replace(b, beside=("a",)), [replace(a, beside=("b", "c")), replace(b, beside=("a", "c"))]
+    f = forms(replace(gap, candidates=(a, b, c, d, after_a, *joint)))
+    assert {e for e in _neighbours(f, (0, 4)) if len(e) == 3} == {(2, 5, 6), (0, 3, 4)}
+    assert _linearised(f, [0, 1]) == (0, 4)  # beside `a`, and nothing that does not act
+    assert _linearised(f, [0, 1, 2]) == (2, 5, 6)
+    assert _linearised(f, [1]) == (1,)
+
+
+def test_what_is_known_of_a_random_effect_from_elsewhere_no_form_imitates():
+    gap = gap_of({0: 30.0})
+    nothing, n = np.zeros(0), gap.residual.size
+    lattice = Candidate("lattice", (), nothing, nothing, nothing, np.zeros(n), np.zeros((n, 0)), nothing,
+                        nothing, np.full(n, 1e-3))  # fmt: skip
+    for evidence, kept in ((400.0, True), (0.0, False)):
+        f = forms(replace(gap, candidates=(*gap.candidates, replace(lattice, evidence=evidence))))
+        others = Heldout.of(f, np.ones(3), (0, 4))
+        assert others is not None
+        assert (4 in _predicting(others, (0, 4))) == kept

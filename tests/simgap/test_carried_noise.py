@@ -173,6 +173,17 @@ def test_rounding_shows_in_a_force_that_moves_and_not_in_one_that_rests_or_jumps
     assert np.abs(shown[:, 2:]).max() < 1e-9
 
 
+@pytest.mark.parametrize("size", [0.3, 1.5, 8.0, 20.0])
+@pytest.mark.parametrize("rate", [0.02, 0.2])
+def test_most_of_the_rounding_of_a_moving_force_shows_whatever_its_speed(size, rate):
+    """A string pulled tight within half a step of each reading cuts corners and errs more than readings."""
+    t = np.arange(600)
+    force = size * np.sin(rate * t + 1) + 0.37 + 0.1 * np.random.default_rng(0).standard_normal(t.size)
+    read = np.round(force)
+    left = read - force - rounding_error(read[:, None], 1.0)[:, 0]
+    assert np.var(left) < 0.5 * np.var(read - force)
+
+
 @pytest.mark.parametrize("true", [0.0, 0.5])
 def test_rounding_alone_is_no_effect_and_hides_none(true):
     """Pads are softer by `true`; the force moves by some steps, to which it is rounded."""
@@ -181,6 +192,7 @@ def test_rounding_alone_is_no_effect_and_hides_none(true):
         rng = np.random.default_rng(seed)
         trial, k = np.divmod(np.arange(TRIALS * SAMPLES), SAMPLES)
         force = 0.7 * step * np.sin(0.2 * k + 6 * rng.random(TRIALS)[trial])
+        force += step * rng.random(TRIALS)[trial] + 0.05 * rng.standard_normal(k.size)  # no two rounded alike
         read = step * np.round(force / step)
         error = np.concatenate([rounding_error(read[trial == r, None], step)[:, 0] for r in range(TRIALS)])
         sd = np.hypot(PLACE_SD, GIVE * step / np.sqrt(12))

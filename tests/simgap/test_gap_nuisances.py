@@ -13,10 +13,10 @@ from simgap.effects import catalogue
 from simgap.effects.base import gradient, swung, tips
 from simgap.gap.assemble import _density, _likeliest, with_noise
 from simgap.gap.assemble import _turning as turned_variance
-from simgap.gap.frame import CHANNELS, build
+from simgap.gap.frame import CHANNELS, OFFSET, _one_finger, build
 from simgap.gap.nuisances import BEYOND, _inertial, _late_rates, _settling
 from simgap.gap.problem import Nuisances, problem
-from simgap.gap.residuals import residuals, turned
+from simgap.gap.residuals import _misread_moment, residuals, turned
 from simgap.phases import Phase
 
 
@@ -82,7 +82,7 @@ def test_a_lifted_block_turns_until_its_moments_balance(given, off):
     force = np.array([[[grip, (weight - lift) / 2, -grip, (weight + lift) / 2]]])
     world = given.frame.world._replace(couple=np.asarray(off), carry=np.ones((1, 1)))
     one = np.ones((1, 1))
-    found, rise = turned(
+    found, rise, ease = turned(
         world,
         weight * one,
         width * one,
@@ -92,14 +92,38 @@ def test_a_lifted_block_turns_until_its_moments_balance(given, off):
     )
     assert found[0, 0] == pytest.approx(turn)
     assert rise[0, 0] == 0.0
+    assert ease[0, 0] == pytest.approx(compliance)
 
 
 def test_a_standing_block_turns_only_once_its_load_leaves_its_feet(given):
     world, one = given.frame.world._replace(carry=np.zeros((1, 1))), np.ones((1, 1))
     for apart, tips_over in ((1e-4, False), (3e-3, True)):
         force = np.array([[[4.0, 0.05, -4.0, 0.05]]])
-        turn, rise = turned(world, 0.4 * one, 0.02 * one, np.array([5.0, 0.0]), force, apart * one)
+        turn, rise, _ = turned(world, 0.4 * one, 0.02 * one, np.array([5.0, 0.0]), force, apart * one)
         assert (turn[0, 0] > 0) == (rise[0, 0] > 0) == tips_over
+
+
+@double_precision
+@pytest.mark.parametrize("compliance", [0.0, 5.0, 15.0])
+def test_an_offset_is_as_noisy_as_the_moment_that_turns_its_block(given, compliance):
+    """Monte Carlo: noise of heights and shears through the equation itself."""
+    rng, n, world = np.random.default_rng(3), 20_000, given.frame.world
+    width, grip, heights, give = 0.02, 3.0, 1e-3, float(np.mean(world.give_shear))
+    of_place, of_force = 2e-5, 0.02  # each finger's
+    one, zero = np.ones((1, n)), np.zeros((1, n))
+    plain = np.zeros((1, n, len(CHANNELS)))
+    plain[..., OFFSET] = np.sqrt(2) * np.hypot(of_place, give * of_force)
+    plain[..., CHANNELS.index("shear")] = of_force / np.sqrt(2)
+    fy1, fy2 = (0.2 + of_force * rng.standard_normal((1, n)) for _ in range(2))
+    force = np.stack([grip * one, fy1, -grip * one, fy2], -1)
+    apart = heights + np.sqrt(2) * of_place * rng.standard_normal((1, n)) - give * (fy2 - fy1)
+    world = world._replace(carry=one)
+    turn, _, ease = turned(world, 0.4 * one, width * one, np.array([0.0, compliance]), force, apart)
+    arrays = given.frame.arrays._replace(plain=plain)
+    sd = np.hypot(plain[..., OFFSET], 3e-5)  # of which a part is no noise
+    wider = _misread_moment(world, arrays, width * one, ease, force, sd)
+    noise = np.sqrt(np.mean(np.square(wider * sd) - 3e-5**2 + zero))
+    assert noise == pytest.approx(np.std(apart - width * turn), rel=0.03)
 
 
 @double_precision
@@ -197,3 +221,12 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
     first = np.flatnonzero(there & (arrays.phase[0, :, Phase.CARRY] > 0))[0]
     assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05)
     assert np.abs(change[:first]).max() < 1e-9
+
+
+def test_a_finger_that_still_presses_harder_is_no_gap_and_forces_in_balance_may_be_one():
+    t = np.arange(10) / 20.0
+    force = np.zeros((10, 4))
+    force[0] = -0.065, 0.02, -0.30, -0.41  # the right finger leaves last, while the left one rings
+    force[1] = 0.3, 0.2, -0.3, 0.2  # late forces of both
+    found = _one_finger(t, force, np.zeros(10, int), np.ones(10, bool), np.array([0.0]), np.full(10, 0.01))
+    np.testing.assert_array_equal(np.flatnonzero(found), [0])
