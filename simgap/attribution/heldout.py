@@ -176,15 +176,20 @@ class Heldout:
         return cls(noise, whole, among, folds)
 
     def how_far(self, effects: Sequence[int]) -> HowFar | None:
-        """How far a set of effects shrinks the gap; None if held-out trials show none."""
+        """How far a set of effects shrinks the gap; None if held-out trials show none.
+
+        A trial that is quieter than stated noise shows none, and takes nothing from that of the others.
+        """
         (before, _), (after, _) = self._squares(()), self._squares(effects)
         plain, z = fitted(self.whole, ()), self.whole.spectrum.num_nuisances
         determined = z - float(np.trace(plain.covariance))
         floor = np.array([*(test.count.sum() for _, test in self.folds), determined])
-        if float((before - floor).sum()) <= 0:
+        shown = before > floor
+        if not shown.any():
             return None
-        n, gone = float(floor.sum()), fraction_gone(before - after, before - floor)
-        return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *gone, self.gain(effects, ()))
+        n, gone = float(floor[shown].sum()), fraction_gone(*((before - z) * shown for z in (after, floor)))
+        means = (float(each[shown].sum()) / n for each in (before, after))
+        return HowFar(*means, 1.0, *gone, self.gain(effects, ()))
 
     def gain(self, effects: Sequence[int], without: Sequence[int]) -> float:
         """Gain of the log predictive density of all trials [nats] by `effects` over the set `without`."""
