@@ -19,7 +19,7 @@ from simgap.effects import catalogue, forms_of, name_of
 from simgap.gap.frame import build
 from simgap.gap.problem import fit, neutral, problem
 from simgap.gap.search import Search, best_fit
-from simgap.gap.twins import Values, blocks_of, performed, recorded
+from simgap.gap.twins import Values, blocks_of, measured_on, performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.simulate import task_table
@@ -111,7 +111,7 @@ def _gains(
         frame.task, frame.rig, [blocks] * TRIALS, seeds, cause, OperatorSettings(**experiment.operator)
     )
     trials = [recorded(s, frame.task, frame.rig, cause) for s in done]
-    known = _measured(blocks) if experiment.measured else actual
+    known = _measured(blocks) if experiment.measured else measured_on(blocks, actual)
     planned = problem(build(align(trials, frame.task, frame.rig)), known)
     healthy = fit(planned, (), neutral(planned))
 

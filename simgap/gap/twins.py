@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
+from estimation.priors import PROPERTY_LOG_SD
 from hmmseg.cache import cache_folder, keep_numbers, kept_numbers
+from hmmseg.contact.decompose import PROPERTIES
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
@@ -27,6 +29,7 @@ from simgap.attribution.search import clear, doubtful, sought, statistic
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
 from simgap.gap.frame import as_from_wrist, of_wrist, thinned
+from simgap.gap.problem import fit, neutral
 from simgap.gap.search import PROMISING, Identified, Search, search
 from simgap.progress import Progress, silent
 from simgap.source_digest import source_digest
@@ -171,7 +174,8 @@ def twin_statistics(
             continue
         tell("simulating healthy twins")
         try:
-            twins = _recorded(found, which, seed)
+            blocks = blocks_of(found)
+            mine, twins = measured_on(blocks, actual), _recorded(found, blocks, which, seed)
         except (InputError, ValueError):
             return
         for k, trials in zip(which, twins, strict=True):
@@ -180,9 +184,9 @@ def twin_statistics(
             with suppress(InputError):  # a twin that drops its block does not count
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
-                most = healthy_statistic(twin, actual, found.identified, False, PROMISES * doubtful(value))
+                most = healthy_statistic(twin, mine, found.identified, False, PROMISES * doubtful(value))
                 sure = most <= 0 or clear(value, most)  # no sign of a gap counts as zero
-                known.append(most if sure else healthy_statistic(twin, actual, found.identified))
+                known.append(most if sure else healthy_statistic(twin, mine, found.identified))
                 keep_numbers(file, known)
                 yield known[-1]
 
@@ -208,9 +212,9 @@ def own_healthy(found: Search, healthy: AlignedTrials, actual: dict | None) -> I
         yield healthy_statistic(replace(healthy, trials=every[start : start + size]), actual)
 
 
-def _recorded(found: Search, which: range, seed: int) -> list[list[Trial]]:
+def _recorded(found: Search, blocks: Blocks, which: range, seed: int) -> list[list[Trial]]:
     """Recordings of twins, each with as many trials as were searched."""
-    frame, blocks = found.problem.frame, blocks_of(found)
+    frame = found.problem.frame
     trials, task, rig = frame.num_trials, frame.task, frame.rig
     hand = rig.model_copy(update={"rate": float(np.median([trial.rate for trial in found.trials]))})
     seeds = [seed + 7_000_000 + 1000 * k + j for k in which for j in range(trials)]
@@ -227,7 +231,7 @@ def _recorded(found: Search, which: range, seed: int) -> list[list[Trial]]:
     return [twins[k : k + trials] for k in range(0, len(twins), trials)]
 
 
-def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -> list[Plan]:
+def _plans(found: Search, task: BlockTask, rig: Rig, blocks: Blocks) -> list[Plan]:
     """Commands that repeat the recorded motions of every trial, as fast as a hand is commanded."""
     out = []
     for trial, a in zip(found.trials, found.aligned.trials, strict=True):
@@ -240,19 +244,28 @@ def _plans(found: Search, task: BlockTask, rig: Rig, blocks: dict[str, Block]) -
     return out
 
 
-def blocks_of(found: Search) -> dict[str, Block]:
-    """The blocks as measured, else as identified.
-
-    A healthy twin agrees with the measurement, so that a wrong measurement shows as a gap.
+def blocks_of(found: Search) -> Blocks:
+    """The blocks as the recordings alone show them: with others, repeated motions would end in the air.
 
     Raises:
         ValueError: A property is too small to be simulated.
     """
-    given = found.problem
-    values = np.where(given.measured, given.centre, found.blocks[0])
+    given, (values, _) = found.problem, found.blocks
+    if given.measured.any():
+        usual = given.centre * np.array([PROPERTY_LOG_SD[kind] for kind in PROPERTIES])
+        alone = replace(given, sd=np.where(given.measured, usual, given.sd))
+        values = np.where(given.measured, alone.properties(fit(alone, (), neutral(alone)).u), values)
     if not (values > LEAST).all():
         raise ValueError("a property that no block has")
     return {n: Block(*map(float, v)) for n, v in zip(given.frame.task.objects, values, strict=True)}
+
+
+def measured_on(blocks: Blocks, actual: dict | None) -> dict | None:
+    """The same measurements, made of these blocks without error."""
+    return actual and {
+        name: {kind: (getattr(blocks[name], kind), sd) for kind, (_, sd) in of.items()}
+        for name, of in actual.items()
+    }
 
 
 def settings(found: Search) -> OperatorSettings:
