@@ -178,14 +178,14 @@ class Heldout:
     def how_far(self, effects: Sequence[int]) -> HowFar | None:
         """How far a set of effects shrinks the gap; None if held-out trials show none.
 
-        A trial that is quieter than stated noise shows none, and takes nothing from that of the others.
+        Trials that are quieter than noise is allowed to be show none, and hide none of what was measured apart.
         """
         (before, _), (after, _) = self._squares(()), self._squares(effects)
         plain, z = fitted(self.whole, ()), self.whole.spectrum.num_nuisances
         determined = z - float(np.trace(plain.covariance))
         floor = np.array([*(test.count.sum() for _, test in self.folds), determined])
-        shown = before > floor
-        if not shown.any():
+        shown = np.append(np.repeat((before - floor)[:-1].sum() > 0, len(self.folds)), True)
+        if float(((before - floor) * shown).sum()) <= 0:
             return None
         n, gone = float(floor[shown].sum()), fraction_gone(*((before - z) * shown for z in (after, floor)))
         means = (float(each[shown].sum()) / n for each in (before, after))

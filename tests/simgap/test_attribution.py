@@ -448,10 +448,12 @@ def test_what_changes_sign_between_trials_is_no_cause():
     assert attribute(gap).verdict == "unknown"
 
 
-def test_a_measurement_that_trials_contradict_is_named_though_no_trial_is_predicted_better():
+@pytest.mark.parametrize("noise", [1.0, 0.3])
+def test_a_measurement_that_trials_contradict_is_named_though_no_trial_is_predicted_better(noise):
+    """Nor are trials that are quieter than any noise that is allowed for a gap of less than none."""
     rows = rows_of(samples=30)
     column = np.where(rows.channel == 0, 3.0, 0.0)[:, None]  # by one sd of what was measured
-    residual = np.random.default_rng(0).standard_normal(rows.time.size) + 9.0 * column[:, 0]
+    residual = noise * np.random.default_rng(0).standard_normal(rows.time.size) + 9.0 * column[:, 0]
     wrong = linear("measured", column, scale=10.0)
     found = attribute(Gap(rows, residual, column, (wrong, linear("other", column[::-1].copy()))))
     assert (found.verdict, found.causes) == ("named", ("measured",))

@@ -32,9 +32,19 @@ def test_other_code_has_a_cache_of_its_own(monkeypatch):
 def test_without_stated_noise_there_are_twins_too():
     rig = RIG.model_copy(update={"noise": Noise()})
     found = search(align(TRIALS[:1], TASK, rig))
-    twin = twins._recorded(found, range(1), 0)
+    twin = twins._recorded(found, twins.blocks_of(found), range(1), 0)
     assert len(twin) == 1 and len(twin[0]) == 1
     assert np.isfinite(twin[0][0].channels["fx1"]).all()
+
+
+def test_twins_have_the_blocks_that_were_recorded_whatever_was_measured():
+    alone = twins.blocks_of(search(align(TRIALS, TASK, RIG), noisy=False))
+    wrong = {"block1": {"height": (alone["block1"].height + 2e-3, 1e-4)}}
+    told = twins.blocks_of(search(align(TRIALS, TASK, RIG), wrong, noisy=False))
+    assert told["block1"].height == pytest.approx(alone["block1"].height, abs=2e-4)
+    assert told["block2"].width == pytest.approx(alone["block2"].width, abs=1e-4)
+    assert twins.measured_on(told, wrong) == {"block1": {"height": (told["block1"].height, 1e-4)}}
+    assert twins.measured_on(told, None) is None
 
 
 BLOCKS = {name: Block(0.5, 0.02 + 0.004 * k, 0.018, 0.7) for k, name in enumerate(TASK.objects)}
