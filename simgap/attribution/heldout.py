@@ -178,7 +178,7 @@ class Heldout:
     def how_far(self, effects: Sequence[int]) -> HowFar | None:
         """How far a set of effects shrinks the gap; None if held-out trials show none.
 
-        Trials that are quieter than noise is allowed to be show none, and hide none of what was measured apart.
+        Trials quieter than noise is allowed to be show none, and hide none of what was measured apart.
         """
         (before, _), (after, _) = self._squares(()), self._squares(effects)
         plain, z = fitted(self.whole, ()), self.whole.spectrum.num_nuisances
