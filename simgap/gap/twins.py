@@ -29,7 +29,7 @@ from simgap.attribution.search import clear, doubtful, sought, statistic
 from simgap.effects import effect_named
 from simgap.effects.base import Performance
 from simgap.gap.frame import as_from_wrist, of_wrist, thinned
-from simgap.gap.problem import fit, neutral
+from simgap.gap.problem import fit
 from simgap.gap.search import PROMISING, Identified, Search, search
 from simgap.progress import Progress, silent
 from simgap.source_digest import source_digest
@@ -176,6 +176,7 @@ def twin_statistics(
         try:
             blocks = blocks_of(found)
             mine, twins = measured_on(blocks, actual), _recorded(found, blocks, which, seed)
+            shown = {(name, kind): getattr(b, kind) for name, b in blocks.items() for kind in PROPERTIES}
         except (InputError, ValueError):
             return
         for k, trials in zip(which, twins, strict=True):
@@ -184,9 +185,9 @@ def twin_statistics(
             with suppress(InputError):  # a twin that drops its block does not count
                 tell("diagnosing healthy twins")
                 twin = align(trials, frame.task, frame.rig)
-                most = healthy_statistic(twin, mine, found.identified, False, PROMISES * doubtful(value))
+                most = healthy_statistic(twin, mine, shown, False, PROMISES * doubtful(value))
                 sure = most <= 0 or clear(value, most)  # no sign of a gap counts as zero
-                known.append(most if sure else healthy_statistic(twin, mine, found.identified))
+                known.append(most if sure else healthy_statistic(twin, mine, shown))
                 keep_numbers(file, known)
                 yield known[-1]
 
@@ -245,16 +246,18 @@ def _plans(found: Search, task: BlockTask, rig: Rig, blocks: Blocks) -> list[Pla
 
 
 def blocks_of(found: Search) -> Blocks:
-    """The blocks as the recordings alone show them: with others, repeated motions would end in the air.
+    """The blocks as the recordings alone show them, corrected for the best single effect.
+
+    With other blocks, repeated motions would end in the air.
 
     Raises:
         ValueError: A property is too small to be simulated.
     """
-    given, (values, _) = found.problem, found.blocks
-    if given.measured.any():
-        usual = given.centre * np.array([PROPERTY_LOG_SD[kind] for kind in PROPERTIES])
-        alone = replace(given, sd=np.where(given.measured, usual, given.sd))
-        values = np.where(given.measured, alone.properties(fit(alone, (), neutral(alone)).u), values)
+    given, best = found.problem, min((found.healthy, *found.fits), key=lambda one: one.cost)
+    usual = given.centre * np.array([PROPERTY_LOG_SD[kind] for kind in PROPERTIES])
+    alone, u = replace(given, sd=np.where(given.measured, usual, given.sd)), best.u.copy()
+    u[: given.centre.size][given.measured.ravel()] = 0.0
+    values = alone.properties(fit(alone, best.effects, u).u)
     if not (values > LEAST).all():
         raise ValueError("a property that no block has")
     return {n: Block(*map(float, v)) for n, v in zip(given.frame.task.objects, values, strict=True)}
