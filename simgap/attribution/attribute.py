@@ -217,7 +217,7 @@ def attribute(
     if forced:
         models = [_forced(f, forced), *[m for m in models if not m.effects]]
     value = statistic(f, models)
-    detection = detected(value, twins(value) if callable(twins) else twins)
+    detection = detected(value)
     noise = noise_of(f, models[0])
     by_group = (noise**2)[channel_of(f)]
     ranked, others = [m.effects for m in models if m.effects][:EXAMINED], None
@@ -230,9 +230,15 @@ def attribute(
     small = None
     if gap.tolerance is not None and (detection.p_value < ALARM or forced):
         small = _small(f, models, by_group, absorbed)
-    if small is not None and gap.usual:  # a cause that is certain can be mended
+
+    def ignored() -> SmallGap | None:
         chance = probabilities(sets, detection.p_value)
-        small = small if chance["none"] + chance["unknown"] > DOUBT else None
+        certain = gap.usual and chance["none"] + chance["unknown"] <= DOUBT  # can be mended
+        return None if certain else small
+
+    if ignored() is None:  # else twins could only make it likelier that there is none
+        detection = detected(value, twins(value) if callable(twins) else twins)
+        small = ignored() if detection.p_value < ALARM or forced else None
     first = next(iter(examined), ())
     named = _names(f, first) if forced else ()
     verdict = conclude(sets, detection.p_value, small is None, named, unseen=detection.unseen)

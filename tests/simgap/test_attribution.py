@@ -253,6 +253,16 @@ def test_a_gap_below_what_matters_is_none_and_told_with_its_size():
     assert attribute(replace(gap, tolerance=np.full(n, 0.05)), heldout=False).verdict == "named"
 
 
+def test_no_twins_are_simulated_for_a_gap_that_does_not_matter():
+    gap = gap_of({1: 3.0})
+    asked = []
+    for tolerance in (10.0, 0.05):
+        attribute(replace(gap, tolerance=np.full(gap.residual.size, tolerance)), asked.append, heldout=False)
+        if tolerance > 1:
+            assert not asked
+    assert len(asked) == 1
+
+
 def test_a_gap_that_nuisances_hide_where_they_never_are_is_not_small():
     gap = gap_of({1: 3.0})
     gap = replace(gap, tolerance=np.full(gap.residual.size, 10.0))
