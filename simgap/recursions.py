@@ -80,11 +80,13 @@ def tracked(
     constant each, a random walk of variances `walk` (T, N, 3) that is replaced by a new one of variance
     `anywhere` where `new` (T, N, 3): the first weighted value determines it and gives no innovation. A joint
     is at its `place` (T, N, J) where `pinned`; elsewhere it moves by `drift` with variance `wander`, plus one
-    of `shares` (R,) of the variance `jump` (T, J) with prior probabilities `chance` (R,). The likeliest share
-    is chosen sample by sample (a multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
+    of `shares` (R,) of the variance `jump` (T, J) with prior probabilities `chance` (R,). The density of a
+    sample is the mean over shares; the likeliest one is kept (a multiprocess model, class II: Harrison &
+    Stevens, JRSS B 38, 1976).
 
     Returns:
-        Innovations (T, N, 4), their variances over the noise's, and the cost of the choices [nats].
+        Innovations (T, N, 4), their variances over the noise's, and what the mean lacks of the density of the
+        share kept [nats].
     """
     joints, size = pinned.shape[2], pinned.shape[2] + 3
     out, factor, cost = np.zeros_like(values), np.ones_like(values), 0.0
@@ -112,7 +114,7 @@ def tracked(
                     cov[j, j] += wander[t, k, j]
                 loose = loose or not pinned[t, k, j]
             choices = chance.size if loose and weight[t, k].sum() > 0 else 1
-            best, chosen_mean, chosen_cov, paid = -np.inf, mean, cov, 0.0
+            best, chosen_mean, chosen_cov, seen, every = -np.inf, mean, cov, 0.0, -np.inf
             for r in range(choices):
                 m, p = (mean.copy(), cov.copy()) if choices > 1 else (mean, cov)
                 for j in range(joints):
@@ -135,10 +137,11 @@ def tracked(
                     factors[c] = larger**known
                     misses[c] = np.sqrt(known * factors[c] / larger) * w * miss
                     score -= 0.5 * (np.log(factors[c]) + misses[c] ** 2 / (noise * factors[c]))
+                every = np.logaddexp(every, score)
                 if score > best:
-                    best, chosen_mean, chosen_cov, paid = score, m, p, -prior
+                    best, chosen_mean, chosen_cov, seen = score, m, p, score - prior
                     out[t, k], factor[t, k] = misses, factors
-            cost += paid
+            cost += seen - every
             mean, cov = chosen_mean, chosen_cov
             for c in range(4):
                 if constant[c] >= 0:

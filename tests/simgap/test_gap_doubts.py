@@ -133,6 +133,14 @@ def test_a_joint_that_jumps_unseen_costs_one_choice_and_is_followed():
     assert np.sqrt(np.mean(out[0, others, 2] ** 2 / factor[0, others, 2])) < 1.5 * sd
 
 
+def test_choices_that_show_in_no_value_cost_nothing():
+    n = 30
+    joints = np.zeros((n, 4, 2)), np.zeros((n, 2), bool), np.zeros((n, 2)), 4 / 3
+    values = np.random.default_rng(0).standard_normal((n, 4))
+    cost = _tracked(values, 1.0, joints=joints, shares=(0.0, 1.0), chance=(0.9, 0.1))[2]
+    assert cost == pytest.approx(0.0, abs=1e-9)
+
+
 def _ringing(frequency=6.0, damping=0.05, drive=0.3):
     world = world_of(performance())
     return world._replace(ring=np.array([frequency, damping, drive]))
