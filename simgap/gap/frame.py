@@ -207,8 +207,9 @@ def trial_arrays(
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
-    # The finger that touches first pushes a block that stands, for a while, and so does a closing hand.
-    push = np.where(carry, 0.0, changes(mean_of(signals, "x"), sample["x"] / np.sqrt(2)))
+    # The finger that touches first pushes the block for a while, and so does a closing hand; a carried block
+    # swings in the grip as the hand speeds up.
+    push = changes(mean_of(signals, "x"), sample["x"] / np.sqrt(2))
     sd = np.hypot(plain, motion_doubt(signals, sample, push, step, group, rig.fingertip))
     sd[:, FORCES] = np.hypot(sd[:, FORCES], between_samples(t, force, free, edge & carry, boundaries))
     shaken = _shaken(signals, sample, force, carry, subtask, step, group) / rig.gravity
