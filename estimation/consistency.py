@@ -39,6 +39,7 @@ from estimation.design import RISE, Design, PadDoubt
 from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
 from estimation.pads import MISSTATED, SLOPE_SD
 from hmmseg.contact.decompose import ON_GROUND, stack
+from hmmseg.errors import InputError
 from hmmseg.hand.plausibility import scale_to_velocity
 from hmmseg.hand.sensing import WHITE
 from hmmseg.io.rig import Rig
@@ -106,6 +107,16 @@ def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], desi
                 for obj in aligned.task.objects:
                     out.setdefault(f"{obj}.{prop}", tie.text)
     return out
+
+
+def check_motion(aligned: AlignedTrials) -> None:
+    """InputError if positions and velocities contradict each other: no model reproduces both."""
+    for tie in _motion(aligned):
+        if tie.probability > CERTAIN:
+            unit = 1 / np.exp(tie.value)
+            raise InputError(aligned.trials[0].trial.file, tie.text,
+                             f't = {{from = "t", unit = {unit:.2g}}} under [columns] in rig.toml if times are '
+                             "off, or other units of positions or velocities")  # fmt: skip
 
 
 def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:

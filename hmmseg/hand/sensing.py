@@ -214,13 +214,15 @@ def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows
     stuck = np.zeros(values.size, bool)
     standing: dict[float, list[tuple[float, float]]] = {}
     other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
+    least = _share_of_repeats([seen[f] for f in fellows if f != name], shown.size)  # quick, for most runs
     for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
         value, at = float(shown[start]), there[start : stop + 1]
         # If the other finger's force is exactly zero as well, the sensors suppress small readings.
         if stop - start < 2 or (value == 0 and other is not None and np.mean(other[at] == 0) > 0.5):
             continue
-        chance = _chance_of_repeat(name, value, at, seen, fellows, stated)
-        unlikely = _unlikely(stop - start, chance, shown.size)
+        unlikely = _unlikely(stop - start, least, shown.size) and _unlikely(
+            stop - start, _chance_of_repeat(name, value, at, seen, fellows, stated), shown.size
+        )
         if unlikely or (rate is not None and _is_swept(at, t, values, seen[rate])):
             stuck[at] = True
             standing.setdefault(value, []).append((float(t[at[0]]), float(t[at[-1]])))
@@ -261,9 +263,14 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     scatter = whiteness(alive) <= SCATTERS or (stated is not None and not waits)
     if not any(_range(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
         return 1.0
-    differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
+    return _share_of_repeats([own, *others])
+
+
+def _share_of_repeats(channels: list[np.ndarray], more: int = 0) -> float:
+    """Probability that a reading repeats the one before, if none of `more` readings elsewhere does."""
+    differences = [np.diff(v[np.isfinite(v)]) for v in channels]
     pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
-    return (repeats + 1) / (pairs + 2)
+    return (repeats + 1) / (pairs + more + 2)
 
 
 def _unlikely(length: int, chance: float, count: int) -> bool:

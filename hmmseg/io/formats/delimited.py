@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -114,6 +114,7 @@ def _layout(path: Path, encoding: str) -> Layout:
                 header = header_of(text, comments, separator)
                 if header is None:
                     header = cells_of(text, separator)
+                    check_header(header, f"{path}: row {number + 1}")
                     skipped.append(number)
                 while header and not header[-1].strip():  # trailing separators
                     header.pop()
@@ -154,9 +155,20 @@ def _layout(path: Path, encoding: str) -> Layout:
             rows.append(number)
     if "\0" in line:
         notes.append(f"{path}: ends in zero bytes, which are left out: the recording was broken off")
-    names = tuple(name.strip() for name in header or ())
+    if header is None:
+        raise InputError(str(path), "is empty", "a table with a header row")
+    names = tuple(name.strip() for name in header)
     return Layout(encoding, separator or ",", decimal, names, units, frozenset(skipped),
                   np.array(rows, dtype=int), most, tuple(notes))  # fmt: skip
+
+
+def rows_in(path: Path, layout: Layout) -> Iterator[tuple[int, list[str]]]:
+    """Number, from 1, and cells of each row, as text."""
+    kept = set(layout.rows.tolist())
+    with path.open(encoding=layout.encoding, newline="") as file:
+        for number, line in enumerate(file):
+            if number in kept:
+                yield number + 1, cells_of(line.rstrip("\r\n"), layout.separator)
 
 
 def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] | None:
@@ -173,6 +185,12 @@ def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] |
         if len(names) == len(cells) and not _numeric(names):
             return names
     return None
+
+
+def check_header(cells: Sequence[str], where: str) -> None:
+    """InputError for a header whose cells are all numbers, as where a file has none."""
+    if any(cell.strip() for cell in cells) and _numeric(cells):
+        raise InputError(where, "holds numbers", "a header row with the columns' names")
 
 
 def separator_of(line: str) -> str:
@@ -192,7 +210,7 @@ def cells_of(line: str, separator: str) -> list[str]:
     return line.split(separator)
 
 
-def _numeric(cells: list[str]) -> bool:
+def _numeric(cells: Sequence[str]) -> bool:
     return all(NUMBER.fullmatch(cell.strip().replace(",", ".")) for cell in cells)
 
 
