@@ -57,6 +57,7 @@ WELL_MADE = {
 }  # fmt: skip
 # prior: sds of what is misstated, in the same units
 SIZE = {"squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "level": 0.02}
+COARSE = 5e-4  # limit: m; of steps of positions: pads of usual stiffness give as much in a grip
 BRIEF = 5  # numerics: fewer samples may be a glitch
 FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
@@ -101,6 +102,9 @@ class Tie:
 def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> dict[str, str]:
     """Why properties get no number, by `object.property`: contradictory scales."""
     out: dict[str, str] = {}
+    if (step := max(one.trial.step for one in aligned.trials)) > COARSE:
+        text = f"positions go in steps of {1e3 * step:.2g} mm, as much as pads give in a grip"
+        out = {f"{obj}.{prop}": text for obj in aligned.task.objects for prop in ("width", "height")}
     for tie in ties(aligned, weighed, design):
         if tie.probability > CERTAIN:
             for prop in tie.properties:
@@ -113,10 +117,10 @@ def check_motion(aligned: AlignedTrials) -> None:
     """InputError if positions and velocities contradict each other: no model reproduces both."""
     for tie in _motion(aligned):
         if tie.probability > CERTAIN:
-            unit = 1 / np.exp(tie.value)
+            time = f't = {{from = "t", unit = {np.exp(-tie.value):.2g}}}'
             raise InputError(aligned.trials[0].trial.file, tie.text,
-                             f't = {{from = "t", unit = {unit:.2g}}} under [columns] in rig.toml if times are '
-                             "off, or other units of positions or velocities")  # fmt: skip
+                             f"{time} under [columns] in rig.toml if times are off, or other units of "
+                             "positions or velocities")  # fmt: skip
 
 
 def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:

@@ -29,9 +29,8 @@ def identify(
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         found, hand = find_inputs(trials, task, rig)
         if not isinstance(read_task(found), BlockTask):
-            raise InputError(
-                str(found), "a plain ordered task has no blocks to identify", "objects and moves"
-            )
+            problem = "a plain ordered task has no blocks to identify"
+            raise InputError(str(found), problem, "objects and moves")
         out.finish(run(out, trials, found, require_rig(hand, trials), method, actual))
 
 

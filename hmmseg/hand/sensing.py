@@ -166,6 +166,28 @@ def remove_faults(trial: Trial, rig: Rig) -> Trial:
     return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
 
 
+def check_steps(trial: Trial) -> Trial:
+    """The trial with a warning of positions in steps coarser than their noise, and these in `step` [m].
+
+    What stands still is then rounded alike in every sample, which no average removes: `touch_sd` has it.
+    """
+    coarse = {name: step for name in CARTESIAN if (step := _coarse_step(trial.channels[name])) > 0}
+    if not coarse:
+        return trial
+    step = max(coarse.values())
+    line = (f"{trial.file}: {', '.join(coarse)} go in steps of {1e3 * step:.3g} mm, more than their noise: "
+            "widths and heights are known no better")  # fmt: skip
+    sd = float(np.hypot(coarse.get("x1", 0.0), coarse.get("x2", 0.0)) / np.sqrt(12))
+    return replace(trial, touch_sd=sd, step=step, warnings=(*trial.warnings, line))
+
+
+def _coarse_step(values: np.ndarray) -> float:
+    """Step between the readings of a channel if it is coarser than their noise, else 0."""
+    there = values[np.isfinite(values)]
+    step = float(np.diff(np.unique(np.round(there, 9))).min(initial=np.inf)) if there.size > 1 else np.inf
+    return step if step < np.inf and white_sd(there, 1) < step / 2 else 0.0
+
+
 def _group_channels(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
     """Channels grouped by quantity, as each is compared with its fellows, and the noise stated by the rig."""
     noise = rig.noise
@@ -214,14 +236,17 @@ def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows
     stuck = np.zeros(values.size, bool)
     standing: dict[float, list[tuple[float, float]]] = {}
     other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
+    rounded = name not in FORCE_CHANNELS and _coarse_step(shown) > 0  # and repeats itself at rest
     least = _share_of_repeats([seen[f] for f in fellows if f != name], shown.size)  # quick, for most runs
     for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
         value, at = float(shown[start]), there[start : stop + 1]
         # If the other finger's force is exactly zero as well, the sensors suppress small readings.
         if stop - start < 2 or (value == 0 and other is not None and np.mean(other[at] == 0) > 0.5):
             continue
-        unlikely = _unlikely(stop - start, least, shown.size) and _unlikely(
-            stop - start, _chance_of_repeat(name, value, at, seen, fellows, stated), shown.size
+        unlikely = (
+            not rounded
+            and _unlikely(stop - start, least, shown.size)
+            and _unlikely(stop - start, _chance_of_repeat(name, value, at, seen, fellows, stated), shown.size)
         )
         if unlikely or (rate is not None and _is_swept(at, t, values, seen[rate])):
             stuck[at] = True

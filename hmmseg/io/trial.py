@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,6 +39,7 @@ class Trial(Tabled):
         notes: what was found out while reading it.
         hidden: properties that this hand cannot reveal, with the reason.
         touch_sd: systematic uncertainty of the distance at which the fingers touch a block [m].
+        step: steps in which positions are recorded, if coarser than their noise, else 0 [m].
         touches: times of touch and release known apart from forces, with their standard deviations [s].
         timing: (num_timesteps,) uncertainty of the time at which a force changes [s].
         inertia: (num_timesteps, 2), only of a wrist sensor, whose forces are halved between the fingers:
@@ -56,6 +58,7 @@ class Trial(Tabled):
     notes: tuple[str, ...] = ()
     hidden: dict[str, str] = field(default_factory=dict)
     touch_sd: float = 0.0
+    step: float = 0.0
     touches: tuple[tuple[float, float], ...] = ()
     timing: np.ndarray | None = None
     inertia: np.ndarray | None = None
@@ -127,6 +130,7 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
             raise InputError(f"{table.file}: column {name}", f"has {len(values)} rows",
                              f"{table.rows.size} as in the others")  # fmt: skip
     _check_names(table, columns, names, optional, task is not None)
+    third = () if task is not None or rig is None or rig.gripper else _of_more_fingers(table.names)
     t, origin = mapped_times(table, rig)
     channels: dict[str, np.ndarray] = {}
     if names is None:  # all channels of a plain task, by our names where they are mapped
@@ -150,7 +154,7 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
         name: table.interpolated[source_of(name, columns)]
         for name in channels if source_of(name, columns) in table.interpolated
     }  # fmt: skip
-    return Trial(table.file, t, channels, origin, between, warnings=table.notes)
+    return Trial(table.file, t, channels, origin, between, warnings=(*table.notes, *third))
 
 
 def mapped_times(table: Table, rig: Rig | None) -> tuple[np.ndarray, int | None]:
@@ -177,6 +181,21 @@ def channels_of(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, 
     return (*CARTESIAN_CHANNELS, ROLL), (*CARTESIAN_OPTIONAL, ROLL)
 
 
+def _finger(name: str) -> int:
+    """Number of the finger whose channel has this name, 0 of any other."""
+    found = re.fullmatch(r"[vf]?[xy](\d)|d?q(\d)[12]", name)
+    return 0 if found is None else int(found.group(1) or found.group(2))
+
+
+def _of_more_fingers(names: tuple[str, ...]) -> tuple[str, ...]:
+    """A warning about columns that are named as those of a third finger."""
+    found = [name for name in names if _finger(name) > 2]
+    if not found:
+        return ()
+    return (f"columns {', '.join(found)} are left out: hands have two fingers here, and what a third bears "
+            "is missing from weights",)  # fmt: skip
+
+
 def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,
                  optional: tuple[str, ...], plain: bool) -> None:  # fmt: skip
     where = table.file
@@ -196,6 +215,10 @@ def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, 
         if ours == "t":
             raise InputError(f"{where}: column t", "missing",
                              f"a header row with a column t of times in s, {MAPPED}")  # fmt: skip
+        if not plain and _finger(ours) == 2 and not any(_finger(name) == 2 for name in table.names):
+            raise InputError(f"{where}: column {theirs}", "missing, as all of finger 2",
+                             f"two fingers, or a gripper with a wrist sensor ([gripper]), {MAPPED}"
+                             )  # fmt: skip
         expected = nearest(theirs, table.names) if plain else f"{', '.join(('t', *(names or ())))}, {MAPPED}"
         raise InputError(f"{where}: column {theirs}", "missing", expected)
     if names is None and len(table.names) < 2:

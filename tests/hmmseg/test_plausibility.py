@@ -120,6 +120,28 @@ def test_a_position_that_repeats_itself_exchanges_no_axes():
     assert any("x1 reads 0.1 in every row" in line for line in trial.warnings)
 
 
+def test_positions_in_coarse_steps_are_told_and_not_taken_for_stuck():
+    rounded = {name: np.round(values, 3) if name[0] in "xy" else values for name, values in CARTESIAN.items()}
+    trial = read_trial(rounded, parse_rig({"noise": {"position": 2e-5}}))
+    assert any("go in steps of 1 mm" in line for line in trial.warnings) and trial.step == pytest.approx(1e-3)
+    assert not any(re.match(r".*: [xy]\d repeats", line) for line in trial.warnings)
+    assert read_trial(CARTESIAN, FREE).step == 0
+
+
+@pytest.mark.parametrize(
+    ("names", "line"), [({"x2", "y2", "vx2", "vy2", "fx2", "fy2"}, "as all of finger 2"), (set(), "")]
+)
+def test_hands_of_other_than_two_fingers_are_told(names, line):
+    table = {k: v for k, v in CARTESIAN.items() if k not in names} | {"fx3": CARTESIAN["fx2"]}
+    if line:
+        with pytest.raises(InputError, match=line):
+            read_trial(table, FREE)
+    else:
+        assert any(
+            "columns fx3 are left out: hands have two fingers" in w for w in read_trial(table, FREE).warnings
+        )
+
+
 def test_y_that_points_down_is_told():
     (line,) = read_trial(changed(CARTESIAN, y=-1, vy=-1, fy=-1), FREE).warnings
     assert re.search("column y1 every hold first goes down .*y points down; expected y1 = ", line)

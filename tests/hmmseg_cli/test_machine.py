@@ -204,7 +204,7 @@ def test_a_folder_that_refuses_files_is_named_with_the_file(lab, monkeypatch, ca
     assert main(["decompose", "task.toml", "--json", "out.json"]) == 2
     assert capsys.readouterr().err.startswith(f"--json out.json: {lab} cannot be written to")
     assert main(["demo"]) == 2
-    assert capsys.readouterr().err.startswith(f"--figures demo: {lab} cannot be written to")
+    assert capsys.readouterr().err.startswith(f"--report demo/report.html: {lab} cannot be written")
 
 
 def test_names_may_hold_what_a_file_system_allows(lab, capsys):
