@@ -95,6 +95,8 @@ def _value(entry: Any, where: str, unit: str) -> float:
         if entry.get("unit", unit) != unit:
             raise InputError(f"{where}.unit", f"found {entry['unit']!r}", repr(unit))
         entry = entry.get("value", entry.get("mean"))
+    if entry is None:
+        raise InputError(where, "has no value", f"a number in {unit}")
     low, high = LIMITS[where.rpartition(".")[2].replace("lower_bound", "friction")]
     return number(entry, where, f"a positive number in {unit}, from {low:g} to {high:g}", low, high)
 

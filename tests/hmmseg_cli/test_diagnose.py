@@ -37,6 +37,13 @@ def test_scales_that_contradict_each_other_are_told_before_any_search(tmp_path):
         hmmseg.diagnose(slow, FOLDER / "task.toml", {k: v for k, v in rig.items() if k != "rate"})
 
 
+def test_no_trial_is_its_own_healthy_one(capsys):
+    hand = ["--task", str(FOLDER / "task.toml"), "--rig", str(FOLDER / "rig.toml")]
+    trial = str(FOLDER / "trial_01.csv")
+    assert main(["diagnose", trial, *hand, "--healthy", trial]) == 2
+    assert "the same trial as" in capsys.readouterr().err
+
+
 def test_the_next_experiment_says_what_it_promises():
     asked = {
         "do": "work twice as fast",
