@@ -102,9 +102,11 @@ class Tie:
 def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> dict[str, str]:
     """Why properties get no number, by `object.property`: contradictory scales."""
     out: dict[str, str] = {}
-    if (step := max(one.trial.step for one in aligned.trials)) > COARSE:
-        text = f"positions go in steps of {1e3 * step:.2g} mm, as much as pads give in a grip"
-        out = {f"{obj}.{prop}": text for obj in aligned.task.objects for prop in ("width", "height")}
+    coarsest = np.max([one.trial.step for one in aligned.trials], axis=0)  # across and up
+    for prop, step in zip(("width", "height"), coarsest.tolist(), strict=True):
+        if step > COARSE:
+            text = f"positions go in steps of {1e3 * step:.2g} mm, as much as pads give in a grip"
+            out |= {f"{obj}.{prop}": text for obj in aligned.task.objects}
     for tie in ties(aligned, weighed, design):
         if tie.probability > CERTAIN:
             for prop in tie.properties:

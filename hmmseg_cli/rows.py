@@ -45,7 +45,7 @@ class Rows:
         self._first = True
         self._start: datetime | None = None  # of ISO stamps
         names = [name.strip() for name in cells_of(header, self._separator)]
-        check_header(names, f"{WHERE}: row {self._number}")
+        check_header(names, WHERE)
         check_unique(names, WHERE)
         self._num, self._names, self._picked, self._scales = len(names), names, [], []
         self._unstated: list[int] = []  # channels without a unit in the rig

@@ -74,8 +74,8 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     trial = remove_faults(trial, rig)
     warnings = check(trial, rig)
     trial = remove_roll(trial)
-    if not rig.jointed and rig.gripper is None and not is_halved(trial):
-        trial = check_steps(trial)
+    if not rig.jointed:
+        trial = check_steps(trial, rig)
     if rig.gripper is not None:
         trial = two_fingers(trial, rig)
     elif is_halved(trial):

@@ -166,18 +166,21 @@ def remove_faults(trial: Trial, rig: Rig) -> Trial:
     return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
 
 
-def check_steps(trial: Trial) -> Trial:
+def check_steps(trial: Trial, rig: Rig) -> Trial:
     """The trial with a warning of positions in steps coarser than their noise, and these in `step` [m].
 
     What stands still is then rounded alike in every sample, which no average removes: `touch_sd` has it.
     """
-    coarse = {name: step for name in CARTESIAN if (step := _coarse_step(trial.channels[name])) > 0}
-    if not coarse:
+    across, up = ("x1", "x2"), ("y1", "y2")
+    if rig.gripper is not None:
+        across, up = rig.gripper.opening, (rig.gripper.position[rig.gripper.up[-1]],)
+    steps = {name: step for name in (*across, *up) if (step := _coarse_step(trial.channels[name])) > 0}
+    if not steps:
         return trial
-    step = max(coarse.values())
-    line = (f"{trial.file}: {', '.join(coarse)} go in steps of {1e3 * step:.3g} mm, more than their noise: "
-            "widths and heights are known no better")  # fmt: skip
-    sd = float(np.hypot(coarse.get("x1", 0.0), coarse.get("x2", 0.0)) / np.sqrt(12))
+    line = (f"{trial.file}: {', '.join(steps)} in steps of {1e3 * max(steps.values()):.3g} mm, more than the "
+            "noise: widths and heights are known no better")  # fmt: skip
+    sd = float(np.linalg.norm([steps.get(name, 0.0) for name in across]) / np.sqrt(12))
+    step = tuple(max(steps.get(name, 0.0) for name in names) for names in (across, up))
     return replace(trial, touch_sd=sd, step=step, warnings=(*trial.warnings, line))
 
 

@@ -296,7 +296,9 @@ def _with_still_axes(trial: Trial, rig: Rig) -> Trial:
         if np.isfinite(values).any():
             continue
         if name not in may:
-            problem = next((f.problem.partition(",")[0] for f in trial.faults if f.channel == name), "is empty")
+            problem = next(
+                (f.problem.partition(",")[0] for f in trial.faults if f.channel == name), "is empty"
+            )
             raise InputError(f"{trial.file}: column {name}", problem, "readings of a working sensor")
         channels[name] = np.zeros(trial.t.size)
     return replace(trial, channels=channels)
@@ -395,6 +397,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(fy), t)), _around(t, pose))
     late = np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)) / np.maximum(pace, tool.noise / step)
     timing = np.minimum(late, pose.window / 2)
+    touch_sd = float(np.hypot(touch_sd, trial.touch_sd))
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
                    free=surely, notes=(*_notes(trial, rig, tool), *strays),
                    hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip

@@ -39,7 +39,8 @@ class Trial(Tabled):
         notes: what was found out while reading it.
         hidden: properties that this hand cannot reveal, with the reason.
         touch_sd: systematic uncertainty of the distance at which the fingers touch a block [m].
-        step: steps in which positions are recorded, if coarser than their noise, else 0 [m].
+        step: steps in which places across (or the opening) and up are recorded, if coarser than their noise,
+            else 0 [m].
         touches: times of touch and release known apart from forces, with their standard deviations [s].
         timing: (num_timesteps,) uncertainty of the time at which a force changes [s].
         inertia: (num_timesteps, 2), only of a wrist sensor, whose forces are halved between the fingers:
@@ -58,7 +59,7 @@ class Trial(Tabled):
     notes: tuple[str, ...] = ()
     hidden: dict[str, str] = field(default_factory=dict)
     touch_sd: float = 0.0
-    step: float = 0.0
+    step: tuple[float, ...] = (0.0, 0.0)
     touches: tuple[tuple[float, float], ...] = ()
     timing: np.ndarray | None = None
     inertia: np.ndarray | None = None

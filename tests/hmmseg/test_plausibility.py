@@ -123,9 +123,11 @@ def test_a_position_that_repeats_itself_exchanges_no_axes():
 def test_positions_in_coarse_steps_are_told_and_not_taken_for_stuck():
     rounded = {name: np.round(values, 3) if name[0] in "xy" else values for name, values in CARTESIAN.items()}
     trial = read_trial(rounded, parse_rig({"noise": {"position": 2e-5}}))
-    assert any("go in steps of 1 mm" in line for line in trial.warnings) and trial.step == pytest.approx(1e-3)
+    assert any("in steps of 1 mm" in line for line in trial.warnings) and trial.step == pytest.approx(
+        (1e-3, 1e-3)
+    )
     assert not any(re.match(r".*: [xy]\d repeats", line) for line in trial.warnings)
-    assert read_trial(CARTESIAN, FREE).step == 0
+    assert read_trial(CARTESIAN, FREE).step == (0, 0)
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
 
     layout = find_layout(path)
     names = [name for name in layout.names if name]
+    check_header(names, str(path))
     check_unique(names, str(path))
     chosen = [i for i, name in enumerate(layout.names) if name and (wanted is None or name in wanted)]
     frame = pd.read_csv(
@@ -114,7 +115,6 @@ def _layout(path: Path, encoding: str) -> Layout:
                 header = header_of(text, comments, separator)
                 if header is None:
                     header = cells_of(text, separator)
-                    check_header(header, f"{path}: row {number + 1}")
                     skipped.append(number)
                 while header and not header[-1].strip():  # trailing separators
                     header.pop()
@@ -155,9 +155,7 @@ def _layout(path: Path, encoding: str) -> Layout:
             rows.append(number)
     if "\0" in line:
         notes.append(f"{path}: ends in zero bytes, which are left out: the recording was broken off")
-    if header is None:
-        raise InputError(str(path), "is empty", "a table with a header row")
-    names = tuple(name.strip() for name in header)
+    names = tuple(name.strip() for name in header or ())
     return Layout(encoding, separator or ",", decimal, names, units, frozenset(skipped),
                   np.array(rows, dtype=int), most, tuple(notes))  # fmt: skip
 
@@ -188,9 +186,10 @@ def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] |
 
 
 def check_header(cells: Sequence[str], where: str) -> None:
-    """InputError for a header whose cells are all numbers, as where a file has none."""
-    if any(cell.strip() for cell in cells) and _numeric(cells):
-        raise InputError(where, "holds numbers", "a header row with the columns' names")
+    """InputError for a header of numbers alone, as where there is none."""
+    if cells and _numeric(cells):
+        expected = "a header row with a column t of times in s, but the first row holds numbers"
+        raise InputError(f"{where}: column t", "missing", expected)
 
 
 def separator_of(line: str) -> str:
