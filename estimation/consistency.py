@@ -10,6 +10,7 @@ hand (0 if rig.toml is right), with an uncertainty:
   slope over the position of the hand. Wrong angles, links or bases give it one.
 - *motion*: displacements equal integrated velocities.
 - *room*: no fingertip enters the space of a standing block.
+- *support*: a block on another stands above part of it.
 - *level*: a fingertip that holds a block is neither below its bottom nor above its top.
 
 For each tie two hypotheses are compared: the hand is as accurate as its rig says, or a scale is misstated by
@@ -53,10 +54,19 @@ WRONG = 0.01  # prior: share of recordings in which one such scale is misstated
 # learned: above the sds of 45 healthy hands by consistency.py of commit f82105c, whose slopes were 3e-4: of
 # logarithms of gains and rates, of slopes [m/m], of places [m]; in addition to [systematic] of rig.toml
 WELL_MADE = {
-    "squeeze": 0.015, "balance": 0.03, "rigidity": 1e-3, "motion": 0.04, "room": 5e-4, "level": 1.5e-3,
+    "squeeze": 0.015, "balance": 0.03, "rigidity": 1e-3, "motion": 0.04, "room": 5e-4, "support": 5e-4,
+    "level": 1.5e-3,
 }  # fmt: skip
 # prior: sds of what is misstated, in the same units
-SIZE = {"squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "level": 0.02}
+SIZE = {
+    "squeeze": 0.7,
+    "balance": 0.7,
+    "rigidity": 0.1,
+    "motion": 0.3,
+    "room": 0.02,
+    "support": 0.02,
+    "level": 0.02,
+}
 COARSE = 5e-4  # limit: m; of steps of positions: pads of usual stiffness give as much in a grip
 BRIEF = 5  # numerics: fewer samples may be a glitch
 FEWEST = 8  # numerics: least samples of a carry to determine a slope
@@ -135,6 +145,7 @@ def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design
         yield from _rigidity(aligned, weighed)
     yield from _motion(aligned)
     yield from _room(aligned, weighed)
+    yield from _support(aligned, weighed)
     yield from _level(aligned, weighed, design)
 
 
@@ -304,6 +315,28 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
         "positions are not as rig.toml has them"
     )
     yield Tie("room", depth, 0.0, ("width",), text)
+
+
+def _support(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """What stands on a block stands above part of it: by how far it would miss in the median trial."""
+    task, off = aligned.task, dict[tuple[str, str], list[float]]()
+    for a, one in zip(weighed, aligned.trials, strict=True):
+        support, grips = dict(task.initial), list(_grips(a, aligned, one.present))
+        for grip in grips:
+            if grip.key == "place":
+                support[grip.object] = task.performed[grip.move].to
+            below = support[grip.object]
+            theirs = [g for g in grips if g.object == below]
+            before = [g for g in theirs if g.subtask < grip.subtask]
+            if theirs:
+                other = before[-1] if before else theirs[0]  # where it stands now
+                off.setdefault((grip.object, below), []).append(max(other.x1 - grip.x2, grip.x1 - other.x2))
+    pair, miss = max(
+        ((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0.0)
+    )
+    if miss > 0:
+        text = f"{pair[0]} stands {1e3 * miss:.2g} mm beside {pair[1]}, on which the task has it"
+        yield Tie("support", miss, 0.0, ("height",), text)
 
 
 def _level(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
