@@ -23,7 +23,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS
 from hmmseg.levels import SURE
-from hmmseg.robust import robust_sd, runs, white_sd
+from hmmseg.robust import coarse_step, robust_sd, runs, white_sd
 
 NEAR = 0.3  # limit: relative error of a stated noise; units differ by factors of 4 and more
 LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with everything below its sensor
@@ -174,21 +174,16 @@ def check_steps(trial: Trial, rig: Rig) -> Trial:
     across, up = ("x1", "x2"), ("y1", "y2")
     if rig.gripper is not None:
         across, up = rig.gripper.opening, (rig.gripper.position[rig.gripper.up[-1]],)
-    steps = {name: step for name in (*across, *up) if (step := _coarse_step(trial.channels[name])) > 0}
+    steps = {name: step for name in (*across, *up) if (step := coarse_step(trial.channels[name])) > 0}
     if not steps:
         return trial
     line = (f"{trial.file}: {', '.join(steps)} in steps of {1e3 * max(steps.values()):.3g} mm, more than the "
             "noise: widths and heights are known no better")  # fmt: skip
     sd = float(np.linalg.norm([steps.get(name, 0.0) for name in across]) / np.sqrt(12))
     step = tuple(max(steps.get(name, 0.0) for name in names) for names in (across, up))
+    if rig.gripper is not None:  # how far its pads give is not read from the opening while they press
+        step = 0.0, step[1]
     return replace(trial, touch_sd=sd, step=step, warnings=(*trial.warnings, line))
-
-
-def _coarse_step(values: np.ndarray) -> float:
-    """Step between the readings of a channel if it is coarser than their noise, else 0."""
-    there = values[np.isfinite(values)]
-    step = float(np.diff(np.unique(np.round(there, 9))).min(initial=np.inf)) if there.size > 1 else np.inf
-    return step if step < np.inf and white_sd(there, 1) < step / 2 else 0.0
 
 
 def _group_channels(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
@@ -239,7 +234,7 @@ def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows
     stuck = np.zeros(values.size, bool)
     standing: dict[float, list[tuple[float, float]]] = {}
     other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
-    rounded = name not in FORCE_CHANNELS and _coarse_step(shown) > 0  # and repeats itself at rest
+    rounded = name not in FORCE_CHANNELS and coarse_step(shown) > 0  # and repeats itself at rest
     least = _share_of_repeats([seen[f] for f in fellows if f != name], shown.size)  # quick, for most runs
     for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
         value, at = float(shown[start]), there[start : stop + 1]
