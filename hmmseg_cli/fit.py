@@ -1,7 +1,7 @@
 """`hmmseg fit`: learn the emissions and durations of a plain ordered task from trials.
 
 `--labels` gives known boundaries: a folder with NAME.json for some trials, {"boundaries": [times in s, null
-where unknown]}, or a CSV file with the columns trial, subtask and start [s].
+where unknown]}, or a CSV or TSV file with the columns trial, subtask and start [s].
 """
 
 from __future__ import annotations
