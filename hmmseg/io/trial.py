@@ -12,7 +12,7 @@ import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
-from hmmseg.io.table import Table, check_unique, numbers, times
+from hmmseg.io.table import Table, check_unique, holds_text, numbers, times
 from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import LARGEST, LATEST, Column, measures, si_factor, source_of, unwrapped
 from hmmseg.tables import Tabled, listed
@@ -131,12 +131,15 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
             raise InputError(f"{table.file}: column {name}", f"has {len(values)} rows",
                              f"{table.rows.size} as in the others")  # fmt: skip
     _check_names(table, columns, names, optional, task is not None)
-    third = () if task is not None or rig is None or rig.gripper else _of_more_fingers(table.names)
+    more = () if task is not None or rig is None or rig.gripper else _of_more_fingers(table.names)
     t, origin = mapped_times(table, rig)
     channels: dict[str, np.ndarray] = {}
     if names is None:  # all channels of a plain task, by our names where they are mapped
         mapped = {source_of(name, columns): name for name in columns}
-        names = tuple(mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t")
+        ours = {name: mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t"}
+        text = [name for name in ours if name not in mapped and holds_text(table.columns[name])]
+        more = tuple(f"{table.file}: column {name} holds text, and is left out" for name in text)
+        names = tuple(own for name, own in ours.items() if name not in text)
     for name in names:
         theirs = source_of(name, columns)
         if theirs not in table.columns:
@@ -155,7 +158,7 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
         name: table.interpolated[source_of(name, columns)]
         for name in channels if source_of(name, columns) in table.interpolated
     }  # fmt: skip
-    return Trial(table.file, t, channels, origin, between, warnings=(*table.notes, *third))
+    return Trial(table.file, t, channels, origin, between, warnings=(*table.notes, *more))
 
 
 def mapped_times(table: Table, rig: Rig | None) -> tuple[np.ndarray, int | None]:
