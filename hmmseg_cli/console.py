@@ -315,7 +315,7 @@ def check_folder(option: str, folder: Path, shown: Path | None = None) -> None:
         while not existing.exists():
             existing = existing.parent
     if not existing.is_dir():
-        raise InputError(where, f"{existing} is not a folder", "a folder")
+        raise InputError(f"{option} {folder}", f"{existing} is not a folder", "a folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise InputError(where, f"{existing} cannot be written to", "a writable folder")
 
