@@ -173,7 +173,9 @@ def check_steps(trial: Trial, rig: Rig) -> Trial:
     """
     across, up = ("x1", "x2"), ("y1", "y2")
     if rig.gripper is not None:
-        across, up = rig.gripper.opening, (rig.gripper.position[rig.gripper.up[-1]],)
+        vertical = rig.gripper.up.lstrip("-")
+        up = tuple(name for axis, name in rig.gripper.position.items() if axis == vertical)
+        across = rig.gripper.opening
     steps = {name: step for name in (*across, *up) if (step := coarse_step(trial.channels[name])) > 0}
     if not steps:
         return trial

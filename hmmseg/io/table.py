@@ -132,7 +132,8 @@ def holds_text(values: np.ndarray) -> bool:
 
     entries = pd.Series(values).dropna()
     words = entries.map(lambda entry: isinstance(entry, str))
-    return bool(entries.size and words.all() and pd.to_numeric(entries, errors="coerce").isna().all())
+    numeric = pd.Series(pd.to_numeric(entries, errors="coerce"))
+    return bool(entries.size and words.all() and numeric.isna().all())
 
 
 def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
