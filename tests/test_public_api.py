@@ -111,7 +111,7 @@ def test_mistakes_say_what_to_write():
     bare = hmmseg.Trial("bare", np.arange(9.0), {"x1": np.zeros(9)})
     with pytest.raises(InputError, match="bare: has no channel fx1"):
         segment(bare, STACK / "task.toml", STACK / "rig.toml")
-    with pytest.raises(InputError, match=r"block1\.width: has no value; expected a number in m"):
+    with pytest.raises(InputError, match=r"block1\.width: missing; expected a number in m"):
         simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": {"weight": 0.3}, "block2": {}})
     with pytest.raises(InputError, match="needs no fit"):
         hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
