@@ -275,9 +275,9 @@ def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iter
     for move, grip in a.grips.items():
         ground = [s for s in aligned.subtasks if s.move == move and s.state == ON_GROUND and present[s.index]]
         for key, of in (("pickup", ground[:1]), ("place", ground[1:])):
-            weight = grip[key].mean(axis=0)
+            s = a.signals
+            weight = grip[key].mean(axis=0) * np.isfinite(s.x1 + s.x2 + s.y)
             if of and weight.any():
-                s = a.signals
                 x1, x2, y = (float(weight @ np.nan_to_num(v) / weight.sum()) for v in (s.x1, s.x2, s.y))
                 yield Grip(move, key, of[0].object or "", of[0].index, x1, x2, y)
 
@@ -321,15 +321,16 @@ def _support(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterato
     """What stands on a block stands above part of it: by how far it would miss in the median trial."""
     task, off = aligned.task, dict[tuple[str, str], list[float]]()
     for a, one in zip(weighed, aligned.trials, strict=True):
-        support, grips = dict(task.initial), list(_grips(a, aligned, one.present))
-        for grip in grips:
-            if grip.key == "place":
-                support[grip.object] = task.performed[grip.move].to
+        grips = {(grip.move, grip.key): grip for grip in _grips(a, aligned, one.present)}
+        support = dict(task.initial)
+        for (move, key), grip in grips.items():
+            if key == "place":
+                support[grip.object] = task.performed[move].to
             below = support[grip.object]
-            theirs = [g for g in grips if g.object == below]
-            before = [g for g in theirs if g.subtask < grip.subtask]
-            if theirs:
-                other = before[-1] if before else theirs[0]  # where it stands now
+            moves = [k for k, each in enumerate(task.performed) if each.object == below]
+            before = [k for k in moves if k < move]
+            there = (before[-1], "place") if before else (min(moves, default=-1), "pickup")
+            if (other := grips.get(there)) is not None:  # where it stands meanwhile
                 off.setdefault((grip.object, below), []).append(max(other.x1 - grip.x2, grip.x1 - other.x2))
     pair, miss = max(
         ((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0.0)

@@ -158,6 +158,10 @@ def test_a_block_put_down_beside_its_support_tells_no_height():
     found = identify(table, FOLDER / "task.toml", rig)
     assert re.match(r"block2 stands \d+ mm beside block1, on which", found.reasons["block1.height"])
     assert ("block1", "width") in found.names and ("block2", "weight") in found.names
+    whole = {"t": trial.t} | {name: values for name, values in trial.channels.items() if name[0] != "v"}
+    early = (trial.t > made.boundaries[0]) & (trial.t < made.boundaries[3])  # block1 is moved unseen
+    unseen = identify(whole | {"x1": np.where(early, np.nan, whole["x1"])}, FOLDER / "task.toml", rig)
+    assert not any("beside" in text for text in unseen.reasons.values())
 
 
 @pytest.mark.parametrize("kind", ("balance", "room"))
