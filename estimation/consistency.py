@@ -10,6 +10,7 @@ hand (0 if rig.toml is right), with an uncertainty:
   slope over the position of the hand. Wrong angles, links or bases give it one.
 - *motion*: displacements equal integrated velocities.
 - *room*: no fingertip enters the space of a standing block.
+- *support*: a block on another stands above part of it.
 - *level*: a fingertip that holds a block is neither below its bottom nor above its top.
 
 For each tie two hypotheses are compared: the hand is as accurate as its rig says, or a scale is misstated by
@@ -39,6 +40,7 @@ from estimation.design import RISE, Design, PadDoubt
 from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
 from estimation.pads import MISSTATED, SLOPE_SD
 from hmmseg.contact.decompose import ON_GROUND, stack
+from hmmseg.errors import InputError
 from hmmseg.hand.plausibility import scale_to_velocity
 from hmmseg.hand.sensing import WHITE
 from hmmseg.io.rig import Rig
@@ -52,10 +54,20 @@ WRONG = 0.01  # prior: share of recordings in which one such scale is misstated
 # learned: above the sds of 45 healthy hands by consistency.py of commit f82105c, whose slopes were 3e-4: of
 # logarithms of gains and rates, of slopes [m/m], of places [m]; in addition to [systematic] of rig.toml
 WELL_MADE = {
-    "squeeze": 0.015, "balance": 0.03, "rigidity": 1e-3, "motion": 0.04, "room": 5e-4, "level": 1.5e-3,
+    "squeeze": 0.015, "balance": 0.03, "rigidity": 1e-3, "motion": 0.04, "room": 5e-4, "support": 5e-4,
+    "level": 1.5e-3,
 }  # fmt: skip
 # prior: sds of what is misstated, in the same units
-SIZE = {"squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "level": 0.02}
+SIZE = {
+    "squeeze": 0.7,
+    "balance": 0.7,
+    "rigidity": 0.1,
+    "motion": 0.3,
+    "room": 0.02,
+    "support": 0.02,
+    "level": 0.02,
+}
+COARSE = 5e-4  # limit: m; of steps of positions: pads of usual stiffness give as much in a grip
 BRIEF = 5  # numerics: fewer samples may be a glitch
 FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
@@ -100,12 +112,27 @@ class Tie:
 def contradictions(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> dict[str, str]:
     """Why properties get no number, by `object.property`: contradictory scales."""
     out: dict[str, str] = {}
+    coarsest = np.max([one.trial.step for one in aligned.trials], axis=0)  # across and up
+    for prop, step in zip(("width", "height"), coarsest.tolist(), strict=True):
+        if step > COARSE:
+            text = f"positions go in steps of {1e3 * step:.2g} mm, as much as pads give in a grip"
+            out |= {f"{obj}.{prop}": text for obj in aligned.task.objects}
     for tie in ties(aligned, weighed, design):
         if tie.probability > CERTAIN:
             for prop in tie.properties:
                 for obj in aligned.task.objects:
                     out.setdefault(f"{obj}.{prop}", tie.text)
     return out
+
+
+def check_motion(aligned: AlignedTrials) -> None:
+    """InputError if positions and velocities contradict each other: no model reproduces both."""
+    for tie in _motion(aligned):
+        if tie.probability > CERTAIN:
+            time = f't = {{from = "t", unit = {np.exp(-tie.value):.2g}}}'
+            raise InputError(aligned.trials[0].trial.file, tie.text,
+                             f"{time} under [columns] in rig.toml if times are off, or other units of "
+                             "positions or velocities")  # fmt: skip
 
 
 def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:
@@ -118,6 +145,7 @@ def ties(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design
         yield from _rigidity(aligned, weighed)
     yield from _motion(aligned)
     yield from _room(aligned, weighed)
+    yield from _support(aligned, weighed)
     yield from _level(aligned, weighed, design)
 
 
@@ -247,9 +275,9 @@ def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iter
     for move, grip in a.grips.items():
         ground = [s for s in aligned.subtasks if s.move == move and s.state == ON_GROUND and present[s.index]]
         for key, of in (("pickup", ground[:1]), ("place", ground[1:])):
-            weight = grip[key].mean(axis=0)
+            s = a.signals
+            weight = grip[key].mean(axis=0) * np.isfinite(s.x1 + s.x2 + s.y)
             if of and weight.any():
-                s = a.signals
                 x1, x2, y = (float(weight @ np.nan_to_num(v) / weight.sum()) for v in (s.x1, s.x2, s.y))
                 yield Grip(move, key, of[0].object or "", of[0].index, x1, x2, y)
 
@@ -287,6 +315,29 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
         "positions are not as rig.toml has them"
     )
     yield Tie("room", depth, 0.0, ("width",), text)
+
+
+def _support(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
+    """What stands on a block stands above part of it: by how far it would miss in the median trial."""
+    task, off = aligned.task, dict[tuple[str, str], list[float]]()
+    for a, one in zip(weighed, aligned.trials, strict=True):
+        grips = {(grip.move, grip.key): grip for grip in _grips(a, aligned, one.present)}
+        support = dict(task.initial)
+        for (move, key), grip in grips.items():
+            if key == "place":
+                support[grip.object] = task.performed[move].to
+            below = support[grip.object]
+            moves = [k for k, each in enumerate(task.performed) if each.object == below]
+            before = [k for k in moves if k < move]
+            there = (before[-1], "place") if before else (min(moves, default=-1), "pickup")
+            if (other := grips.get(there)) is not None:  # where it stands meanwhile
+                off.setdefault((grip.object, below), []).append(max(other.x1 - grip.x2, grip.x1 - other.x2))
+    pair, miss = max(
+        ((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0.0)
+    )
+    if miss > 0:
+        text = f"{pair[0]} stands {1e3 * miss:.2g} mm beside {pair[1]}, on which the task has it"
+        yield Tie("support", miss, 0.0, ("height",), text)
 
 
 def _level(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Design) -> Iterator[Tie]:

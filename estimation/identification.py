@@ -133,8 +133,13 @@ class Identification(Tabled):
 
         return draw_estimates(self.to_json()["properties"], actual, None if path is None else Path(path))
 
-    def plot_posterior(self, actual: Actual | None = None, path: str | Path | None = None):
-        """Corner plot of the joint posterior; returns the axes (num_properties, num_properties)."""
+    def plot_posterior(self, actual: Actual | str | Path | None = None, path: str | Path | None = None):
+        """Corner plot of the joint posterior; returns the axes (num_properties, num_properties).
+
+        A path alone may be given first, as to other plots.
+        """
+        if isinstance(actual, str | Path):
+            actual, path = None, actual
         from estimation.plots import draw_corner
 
         return draw_corner(self.draws, self.names, None if path is None else Path(path), actual)

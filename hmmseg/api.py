@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from hmmseg.contact.decompose import Decomposition
@@ -15,7 +16,7 @@ from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.align import align as align_blocks
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.sequence.fit import fit_sequence
-from hmmseg.sequence.model import SequenceModel
+from hmmseg.sequence.model import SequenceModel, load_model
 from hmmseg.sequence.segment import segment_sequence
 
 Source = Any  # a path, a DataFrame, a dict of arrays, or what the readers give
@@ -89,7 +90,7 @@ def segment(
     trials: Source | Sequence[Source],
     task: Source,
     rig: Source = None,
-    model: SequenceModel | None = None,
+    model: SequenceModel | str | Path | None = None,
 ) -> list[Segmentation]:
     """Subtasks of every trial with the uncertainty of each boundary.
 
@@ -97,7 +98,8 @@ def segment(
         trials: One source or several: paths, tables, or results of `Trial.read`.
         task: A path, a dict, or the result of `Task.read`.
         rig: The nominal hand, which a task of blocks needs.
-        model: Of a plain ordered task, from `fit`; learned from these trials by default.
+        model: Of a plain ordered task, from `fit`, or a file of `hmmseg fit`; learned from these trials by
+            default.
 
     Returns:
         One segmentation a trial, with times in s.
@@ -116,7 +118,8 @@ def segment(
     """
     order = Task.read(task)
     if isinstance(order, SequenceTask):
-        return segment_sequence(read_trials(trials, task=order), order, model)
+        learned = load_model(model, order) if isinstance(model, str | Path) else model
+        return segment_sequence(read_trials(trials, task=order), order, learned)
     if rig is None:
         raise InputError("rig", "missing", "the nominal hand of a task of blocks")
     return align(trials, order, rig).segmentations
@@ -125,14 +128,16 @@ def segment(
 def fit(
     trials: Source | Sequence[Source],
     task: Source,
-    labels: Mapping[str, Sequence[float | None] | Mapping[str, float]] | None = None,
+    labels: Source = None,
 ) -> SequenceModel:
     """Learn emissions and durations of a plain ordered task, from labels of some trials or none.
 
     Args:
         trials: One source or several: paths, tables, or results of `Trial.read`.
         task: A path, a dict, or the result of `Task.read`.
-        labels: By name of the trial its boundaries [s], None where unknown, or {subtask: start [s]}.
+        labels: Known boundaries: one entry for each trial or a dict by the trials' names, or a folder or
+            table as for `hmmseg fit --labels`. An entry holds times [s], None where unknown, or
+            {subtask: start [s]}.
 
     Returns:
         A model for `segment`.

@@ -23,6 +23,13 @@ def white_sd(values: np.ndarray, order: int = 2) -> float:
     return robust_sd(np.diff(values, order, axis=0)) / np.sqrt(comb(2 * order, order))
 
 
+def coarse_step(values: np.ndarray) -> float:
+    """Step between the readings of a channel if it is coarser than their noise, else 0."""
+    there = values[np.isfinite(values)]
+    step = float(np.diff(np.unique(np.round(there, 9))).min(initial=np.inf)) if there.size > 1 else np.inf
+    return step if step < np.inf and white_sd(there, 1) < step / 2 else 0.0
+
+
 def runs(found: np.ndarray) -> list[tuple[int, int]]:
     """Start and stop of each run of true samples."""
     edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(int)))

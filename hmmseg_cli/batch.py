@@ -11,6 +11,7 @@ import functools
 import logging
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -88,7 +89,8 @@ def segment_apart(
     left, lab = list(paths), (task.absolute(), rig.absolute())
     while left:
         with _executor(workers, scheduler) as executor:
-            futures = [executor.submit(segment_one, path.absolute(), *lab) for path in left]
+            with _uninterrupted():  # processes start here
+                futures = [executor.submit(segment_one, path.absolute(), *lab) for path in left]
             try:
                 for future in futures:
                     path, found = left.pop(0), _unless_lost(future)
@@ -96,7 +98,9 @@ def segment_apart(
                     if lost:
                         tell(f"{path}: its worker, or that of a recording near it, was lost; once more")
                         with _executor(1, None) as alone:
-                            found = _unless_lost(alone.submit(segment_one, path.absolute(), *lab))
+                            with _uninterrupted():
+                                again = alone.submit(segment_one, path.absolute(), *lab)
+                            found = _unless_lost(again)
                     advance(1)
                     if found is None:
                         tell(f"{path}: the process that segmented it was killed, twice; it is left out")
@@ -106,8 +110,29 @@ def segment_apart(
                         scheduler = None
                         break
             finally:
-                for future in futures:
+                # A pool cancels its own: elsewhere, its thread would fail on them.
+                for future in () if isinstance(executor, ProcessPoolExecutor) else futures:
                     future.cancel()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Hold interrupts back, in processes that start meanwhile as well, until `_end_silently`."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_silently() -> None:
+    """Let an interrupt end this worker without a traceback."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _unless_lost(future: Future[Segmented]) -> Segmented | None:
@@ -127,8 +152,11 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Processes of this machine, or the workers of a cluster."""
     if scheduler is None:
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            yield pool
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_silently) as pool:
+            try:
+                yield pool
+            finally:
+                pool.shutdown(cancel_futures=True)
         return
     try:
         from dask.distributed import Client

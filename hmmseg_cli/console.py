@@ -134,7 +134,7 @@ class Output:
 
     def write(self, text: str) -> None:
         """Write text to standard output unchanged."""
-        with self._console.unless_lost():
+        with self._console.unless_lost(self._stdout):
             self._stdout.write(text)
             self._stdout.flush()
 
@@ -307,16 +307,17 @@ def named(where: str) -> Iterator[None]:
         raise InputError(where, str(getattr(error, "strerror", None) or error), "a file or folder") from None
 
 
-def check_folder(option: str, folder: Path) -> None:
-    """InputError unless files can be written into the folder, which need not exist yet."""
-    existing = folder.absolute()
-    with named(f"{option} {folder}"):
+def check_folder(option: str, folder: Path, shown: Path | None = None) -> None:
+    """InputError, about the folder or what is `shown`, unless files can be written into the folder, which
+    need not exist yet."""
+    existing, where = folder.absolute(), f"{option} {shown or folder}"
+    with named(where):
         while not existing.exists():
             existing = existing.parent
     if not existing.is_dir():
         raise InputError(f"{option} {folder}", f"{existing} is not a folder", "a folder")
     if not os.access(existing, os.W_OK | os.X_OK):
-        raise InputError(f"{option} {folder}", f"{existing} cannot be written to", "a writable folder")
+        raise InputError(where, f"{existing} cannot be written to", "a writable folder")
 
 
 def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: Sequence[str] = ()) -> None:
@@ -331,7 +332,7 @@ def check_file(option: str, path: Path, suffixes: Sequence[str] = (), refused: S
     if path.is_dir():
         raise InputError(where, "is a folder", "a file")
     if not path.exists():
-        check_folder(option, path.parent)
+        check_folder(option, path.parent, shown=path)
     elif not os.access(path, os.W_OK):
         raise InputError(where, "cannot be written", "a writable file")
 
@@ -416,14 +417,14 @@ class _Screen(Console):
                 yield Segment(escape_control(segment.text), segment.style)
 
     @contextlib.contextmanager
-    def unless_lost(self) -> Iterator[None]:
-        """After a reader is gone, or a disk is full, write nothing more."""
+    def unless_lost(self, stream: Any = None) -> Iterator[None]:
+        """After a reader is gone, or a disk is full, write nothing more to it; `stream`: if not the own."""
         try:
             yield
         except OSError as error:
             self.lost = self.lost or error.strerror or "it is closed"
             self.quiet = True
-            discard(self.file)
+            discard(stream or self.file)
 
 
 def discard(stream: Any) -> None:

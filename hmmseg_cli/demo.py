@@ -17,7 +17,6 @@ def demo(figures: opt.DemoFigures = Path("demo"), json: opt.Json = None, seed: o
          quiet: opt.Quiet = False) -> None:  # fmt: skip
     """Identify two blocks, then find out why rigid fingertips would measure them too narrow; see demo/."""
     page, finding = figures / "report.html", figures / "diagnosis.html"
-    figures.mkdir(parents=True, exist_ok=True)
     with Output("demo", json=json, figures=figures, report=page, seed=seed, quiet=quiet) as out:
         folder = example_folder()
         trials, actual = sorted(folder.glob("trial_*.csv")), folder / "actual.toml"

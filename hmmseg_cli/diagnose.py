@@ -75,7 +75,7 @@ def diagnose(
             own.check_alone({"--rig": rig, "--actual": actual, "--against": against, "--model": model})
             if healthy:
                 refuse("does not go with --healthy and a model", {"--effect": effect, "--task": task})
-                compare_robot(out, paths, distinct_trials(healthy), own)
+                compare_robot(out, paths, distinct_trials([*paths, *healthy])[len(paths) :], own)
             else:
                 diagnose_robot(out, paths, own, task, effect or [])
             return
@@ -145,7 +145,7 @@ def run(
 
     measured = None if actual is None else read_actual(actual, task.objects)
     recordings = read_trials(out, paths, rig)
-    healthy_trials = read_trials(out, distinct_trials(healthy), rig)
+    healthy_trials = read_trials(out, distinct_trials([*paths, *healthy])[len(paths) :], rig)
     with out.progress("diagnosing", total=STAGES) as advance:
         null = align(healthy_trials, task, rig) if healthy_trials else None
         aligned = align(recordings, task, rig)

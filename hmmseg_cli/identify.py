@@ -28,6 +28,9 @@ def identify(
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         found, hand = find_inputs(trials, task, rig)
+        if not isinstance(read_task(found), BlockTask):
+            problem = "a plain ordered task has no blocks to identify"
+            raise InputError(str(found), problem, "objects and moves")
         out.finish(run(out, trials, found, require_rig(hand, trials), method, actual))
 
 
@@ -37,8 +40,7 @@ def run(
     """Identify, write table, figures and page to the destinations of `out`, and return the document."""
     paths = distinct_trials(trials)
     description = read_task(task)
-    if not isinstance(description, BlockTask):
-        raise InputError(str(task), "a plain ordered task has no blocks to identify", "objects and moves")
+    assert isinstance(description, BlockTask)
     from estimation.report import compare, disagreements, properties_table, read_actual
 
     hand = read_rig(rig)

@@ -23,7 +23,7 @@ from hmmseg.errors import InputError
 from hmmseg.io.formats import kind_of, read_table, split_part
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation, Span
-from hmmseg_cli.console import Output, check_file, check_folder
+from hmmseg_cli.console import INPUT_SUFFIXES, Output, check_file, check_folder
 
 KINDS = (".csv", ".parquet", ".mcap")
 
@@ -37,6 +37,8 @@ def check_destination(write: Path | None, paths: Sequence[Path]) -> None:
         if len(paths) > 1:
             raise InputError(where, f"is one file for {len(paths)} recordings", "a folder")
         check_file("--write", write, suffixes=KINDS)
+    elif write.suffix.lower() in INPUT_SUFFIXES and not write.is_dir():
+        raise InputError(where, "unknown kind of file", f"{', '.join(KINDS)}, or a folder")
     else:
         check_folder("--write", write)
         if any(map(_is_set, paths)) and (len(given) > 1 or not all(map(_is_set, paths))):

@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, BinaryIO
 
 from hmmseg.errors import InputError, nearest
-from hmmseg.io.formats.delimited import COMMENTS, SPACES, cells_of, separator_of, units_of
+from hmmseg.io.formats.delimited import COMMENTS, SPACES, cells_of, check_header, separator_of, units_of
 from hmmseg.io.table import check_unique
 from hmmseg.io.units import LARGEST, LATEST, Column, si_factor, source_of
 
@@ -45,6 +45,7 @@ class Rows:
         self._first = True
         self._start: datetime | None = None  # of ISO stamps
         names = [name.strip() for name in cells_of(header, self._separator)]
+        check_header(names, WHERE)
         check_unique(names, WHERE)
         self._num, self._names, self._picked, self._scales = len(names), names, [], []
         self._unstated: list[int] = []  # channels without a unit in the rig

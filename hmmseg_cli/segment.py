@@ -37,6 +37,9 @@ def segment(
     from hmmseg_cli.labels import check_destination, write_labels
 
     with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
+        if method is Segmenter.HMM and (force_threshold, velocity_threshold) != (0.05, 0.05):
+            where = "--force-threshold, --velocity-threshold"
+            raise InputError(where, "go only with the paper's thresholds", "--method qualitative")
         apart, recordings = workers is not None or scheduler is not None, []
         paths = distinct_trials(recordings_in(trials) if apart else trials)
         check_destination(write, paths)

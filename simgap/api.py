@@ -22,7 +22,7 @@ from simgap.world.simulate import SimulatedTrial, simulate_trials
 def simulate(
     task: Source,
     rig: Source,
-    properties: Identification | Mapping[str, Block] | str | Path | None = None,
+    properties: Identification | Mapping[str, Block | Mapping[str, Any]] | str | Path | None = None,
     trials: int = 1,
     seed: int = 0,
     operator: OperatorSettings | None = None,
@@ -32,8 +32,8 @@ def simulate(
     Args:
         task: A task of blocks: a path, a dict, or the result of `Task.read`.
         rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
-        properties: An identification, blocks by name, or a file (identify's JSON, an `actual.toml`); the
-            paper's blocks by default.
+        properties: An identification, blocks or tables of their properties [SI] by name, or a file
+            (identify's JSON, an `actual.toml`); the paper's blocks by default.
         trials: Number of trials.
         seed: Seed of the first trial; each further trial has the next one.
         operator: Ranges from which motions are drawn.
@@ -110,4 +110,6 @@ def _blocks(properties: Any, task: BlockTask) -> Blocks:
         return blocks_of(properties.to_json()["properties"], task, "properties")
     if isinstance(properties, str | Path):
         return read_properties(properties, task)
+    if isinstance(properties, Mapping) and any(isinstance(entry, Mapping) for entry in properties.values()):
+        return blocks_of(properties, task, "properties")
     return properties

@@ -108,6 +108,11 @@ def test_mistakes_say_what_to_write():
         segment(STACK / "trial_01.csv", STACK / "task.toml")
     with pytest.raises(InputError, match="no blocks"):
         align(STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
+    bare = hmmseg.Trial("bare", np.arange(9.0), {"x1": np.zeros(9)})
+    with pytest.raises(InputError, match="bare: has no channel fx1"):
+        segment(bare, STACK / "task.toml", STACK / "rig.toml")
+    with pytest.raises(InputError, match=r"block1\.width: missing; expected a number in m"):
+        simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": {"weight": 0.3}, "block2": {}})
     with pytest.raises(InputError, match="needs no fit"):
         hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
     for none in (
@@ -211,7 +216,7 @@ def test_plots_return_axes_and_save_where_asked(found, tmp_path):
     assert len(found.segmentations[0].plot()) == 7
     assert found.plot_estimates() is not None
     assert len(found.plot_check()) == 2
-    found.plot_posterior(path=tmp_path / "corner.png")
+    found.plot_posterior(str(tmp_path / "corner.png"))
     assert (tmp_path / "corner.png").stat().st_size > 10_000
     assert set(found.to_arviz().posterior) == {f"{o}.{p}" for o, p in found.names}
 
@@ -222,6 +227,14 @@ def test_an_identification_calibrates_the_virtual_model(found):
     again = segment(made.trial, STACK / "task.toml", STACK / "rig.toml")[0]
     starts = np.array([span.start for span in again.spans[1:]])
     assert again.complete and np.abs(starts - made.boundaries).max() < 0.05
+
+
+def test_blocks_may_be_tables_of_their_properties():
+    sizes = {"weight": 0.3, "width": 0.02, "height": 0.02}
+    made = simgap.simulate(
+        STACK / "task.toml", STACK / "rig.toml", dict.fromkeys(("block1", "block2"), sizes)
+    )
+    assert {made[0].blocks["block1"].weight, made[0].blocks["block2"].weight} == {0.3}
 
 
 def test_an_identification_is_simulated_as_its_json_is(found, tmp_path):

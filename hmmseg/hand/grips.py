@@ -15,7 +15,7 @@ import numpy as np
 
 from hmmseg.hand.signals import grouped
 from hmmseg.levels import SURE
-from hmmseg.robust import median_of_known, white_sd
+from hmmseg.robust import coarse_step, median_of_known, white_sd
 
 STEP = 0.02  # numerics: s over which speeds are taken: a gripper's motor changes them no faster
 SOFT = 0.1  # prior: relative error of the yield in a grip, as pads are no ideal springs
@@ -157,8 +157,8 @@ def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.nda
 
 
 def _noise(opening: np.ndarray) -> float:
-    """Noise sd [m] of one sample of the opening."""
-    return max(white_sd(opening), 1e-6)
+    """Noise sd [m] of one sample of the opening, that of its rounding to coarse steps included."""
+    return max(white_sd(opening), coarse_step(opening) / np.sqrt(12), 1e-6)
 
 
 def _with_prior(seen: tuple[float, float], held: float) -> tuple[float, float]:

@@ -21,6 +21,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS, Column
+from hmmseg.levels import SURE
 from hmmseg.robust import runs, white_sd
 
 SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
@@ -156,7 +157,8 @@ def check_lengths(trial: Trial, rig: Rig) -> list[Finding]:
         near = travel * UNITS[unit][1] ** 0.5  # what travels less is in m; a gripper has one unit
         mended = [n for n, each in travels.items() if each > near or gripper is not None]
         return [Finding(name, problem, changed(mended, rig, unit=unit))]
-    if travels and travel < STILL:
+    noise = max((_noise(trial.channels[n]) for n in travels), default=0.0)
+    if 2 * SURE * noise < travel < STILL:  # less is a hand that stands still
         name = next(iter(travels))
         problem = f"travels {travel:.2g} m in all: positions look as if they were in km"
         return [Finding(name, problem, changed(travels, rig, unit="mm"), certain=False)]
@@ -249,7 +251,7 @@ def check_axes(trial: Trial, rig: Rig) -> list[Finding]:
     gripping = np.abs(s.fy1 - s.fy2 if forces else s.fx1) > pressed[forces] / 2
     places = False
     if not rig.jointed and gripping.any():
-        apart = [abs(float(np.nanmedian(v[gripping]))) if np.isfinite(v[gripping]).any() else 0.0
+        apart = [abs(float(np.nanmedian(v[gripping]))) if np.isfinite(v[gripping]).any() else np.nan
                  for v in (s.x2 - s.x1, s.y2 - s.y1)]  # fmt: skip
         places = bool(apart[1] > MORE * apart[0])
     if not forces and not places:

@@ -24,7 +24,7 @@ from hmmseg.hand.plausibility import (
     check_velocities,
     judge,
 )
-from hmmseg.hand.sensing import SPARSE, check_noise, remove_faults
+from hmmseg.hand.sensing import SPARSE, check_noise, check_steps, remove_faults
 from hmmseg.hand.signals import remove_roll
 from hmmseg.hand.wrist import check_gripper, is_halved, join_halves, two_fingers
 from hmmseg.io.formats import LOGS, kind_of, pieces_of, read_table, rows_of, split_part
@@ -74,6 +74,8 @@ def read_trial(source: str | Path | Any, rig: Rig | None = None, task: SequenceT
     trial = remove_faults(trial, rig)
     warnings = check(trial, rig)
     trial = remove_roll(trial)
+    if not rig.jointed:
+        trial = check_steps(trial, rig)
     if rig.gripper is not None:
         trial = two_fingers(trial, rig)
     elif is_halved(trial):

@@ -23,7 +23,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS
 from hmmseg.levels import SURE
-from hmmseg.robust import robust_sd, runs, white_sd
+from hmmseg.robust import coarse_step, robust_sd, runs, white_sd
 
 NEAR = 0.3  # limit: relative error of a stated noise; units differ by factors of 4 and more
 LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with everything below its sensor
@@ -166,6 +166,28 @@ def remove_faults(trial: Trial, rig: Rig) -> Trial:
     return replace(trial, faults=tuple(found), warnings=(*trial.warnings, *lines))
 
 
+def check_steps(trial: Trial, rig: Rig) -> Trial:
+    """The trial with a warning of positions in steps coarser than their noise, and these in `step` [m].
+
+    What stands still is then rounded alike in every sample, which no average removes: `touch_sd` has it.
+    """
+    across, up = ("x1", "x2"), ("y1", "y2")
+    if rig.gripper is not None:
+        vertical = rig.gripper.up.lstrip("-")
+        up = tuple(name for axis, name in rig.gripper.position.items() if axis == vertical)
+        across = rig.gripper.opening
+    steps = {name: step for name in (*across, *up) if (step := coarse_step(trial.channels[name])) > 0}
+    if not steps:
+        return trial
+    line = (f"{trial.file}: {', '.join(steps)} in steps of {1e3 * max(steps.values()):.3g} mm, more than the "
+            "noise: widths and heights are known no better")  # fmt: skip
+    sd = float(np.linalg.norm([steps.get(name, 0.0) for name in across]) / np.sqrt(12))
+    step = tuple(max(steps.get(name, 0.0) for name in names) for names in (across, up))
+    if rig.gripper is not None:  # how far its pads give is not read from the opening while they press
+        step = 0.0, step[1]
+    return replace(trial, touch_sd=sd, step=step, warnings=(*trial.warnings, line))
+
+
 def _group_channels(trial: Trial, rig: Rig) -> list[tuple[list[str], float | None]]:
     """Channels grouped by quantity, as each is compared with its fellows, and the noise stated by the rig."""
     noise = rig.noise
@@ -214,13 +236,18 @@ def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows
     stuck = np.zeros(values.size, bool)
     standing: dict[float, list[tuple[float, float]]] = {}
     other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
+    rounded = name not in FORCE_CHANNELS and coarse_step(shown) > 0  # and repeats itself at rest
+    least = _share_of_repeats([seen[f] for f in fellows if f != name], shown.size)  # quick, for most runs
     for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
         value, at = float(shown[start]), there[start : stop + 1]
         # If the other finger's force is exactly zero as well, the sensors suppress small readings.
         if stop - start < 2 or (value == 0 and other is not None and np.mean(other[at] == 0) > 0.5):
             continue
-        chance = _chance_of_repeat(name, value, at, seen, fellows, stated)
-        unlikely = _unlikely(stop - start, chance, shown.size)
+        unlikely = (
+            not rounded
+            and _unlikely(stop - start, least, shown.size)
+            and _unlikely(stop - start, _chance_of_repeat(name, value, at, seen, fellows, stated), shown.size)
+        )
         if unlikely or (rate is not None and _is_swept(at, t, values, seen[rate])):
             stuck[at] = True
             standing.setdefault(value, []).append((float(t[at[0]]), float(t[at[-1]])))
@@ -261,9 +288,14 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     scatter = whiteness(alive) <= SCATTERS or (stated is not None and not waits)
     if not any(_range(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
         return 1.0
-    differences = [np.diff(v[np.isfinite(v)]) for v in (own, *others)]
+    return _share_of_repeats([own, *others])
+
+
+def _share_of_repeats(channels: list[np.ndarray], more: int = 0) -> float:
+    """Probability that a reading repeats the one before, if none of `more` readings elsewhere does."""
+    differences = [np.diff(v[np.isfinite(v)]) for v in channels]
     pairs, repeats = (sum(d.size for d in differences), sum(int((d == 0).sum()) for d in differences))
-    return (repeats + 1) / (pairs + 2)
+    return (repeats + 1) / (pairs + more + 2)
 
 
 def _unlikely(length: int, chance: float, count: int) -> bool:

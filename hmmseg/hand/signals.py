@@ -24,7 +24,7 @@ import numpy as np
 from hmmseg.contact.equations import turned
 from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import forward, jacobian
-from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import ROLL, Trial, position_pairs
 from hmmseg.robust import bridged
 from hmmseg.tables import Brief
@@ -137,6 +137,9 @@ class Signals(Brief):
 def task_space(trial: Trial, rig: Rig) -> Signals:
     """Signals of a trial: forward kinematics, and the Jacobian for velocities, of the rig."""
     channels, noise, n = trial.channels, rig.noise, trial.t.size
+    for name in (*FORCE_CHANNELS, *(JOINTS if rig.jointed else ("x1", "y1", "x2", "y2"))):
+        if name not in channels:  # of a trial that was made rather than read
+            raise InputError(trial.file, f"has no channel {name}", "those that Trial.read finds")
     out: dict[str, np.ndarray] = {f: channels[f] for f in FORCE_CHANNELS}
     derived = False
     variances = {"x": np.zeros(n), "y": np.zeros(n), "vx": np.zeros(n), "vy": np.zeros(n)}

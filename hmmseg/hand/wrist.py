@@ -287,12 +287,30 @@ def join_halves(trial: Trial, rig: Rig) -> Trial:
     return replace(found, notes=(f"{trial.file}: {HALVES}", *found.notes))
 
 
+def _with_still_axes(trial: Trial, rig: Rig) -> Trial:
+    """The trial with zeros for what reads the same in every row and may: a torque, a place along an axis on
+    which the tool does not move. InputError for any other channel without readings."""
+    gripper, channels = rig.wrist, dict(trial.channels)
+    may = {*gripper.wrench[3:], *(n for a, n in gripper.position.items() if a != gripper.up.lstrip("-"))}
+    for name, values in channels.items():
+        if np.isfinite(values).any():
+            continue
+        if name not in may:
+            problem = next(
+                (f.problem.partition(",")[0] for f in trial.faults if f.channel == name), "is empty"
+            )
+            raise InputError(f"{trial.file}: column {name}", problem, "readings of a working sensor")
+        channels[name] = np.zeros(trial.t.size)
+    return replace(trial, channels=channels)
+
+
 def two_fingers(trial: Trial, rig: Rig) -> Trial:
     """The trial as that of a Cartesian two-finger hand; InputError for contradictions.
 
     `touch_sd` of the result [m]: uncertainty of the openings at which the pads touch.
     """
     gripper = rig.wrist
+    trial = _with_still_axes(trial, rig)
     pose = pose_of(trial, gripper)
     opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
     pressing = grip_force_of(trial.channels, gripper)
@@ -379,6 +397,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(fy), t)), _around(t, pose))
     late = np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)) / np.maximum(pace, tool.noise / step)
     timing = np.minimum(late, pose.window / 2)
+    touch_sd = float(np.hypot(touch_sd, trial.touch_sd))
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
                    free=surely, notes=(*_notes(trial, rig, tool), *strays),
                    hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip

@@ -90,7 +90,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise InputError(str(path), "no such file", "a TOML file") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(str(path), f"cannot be read ({error})", "a TOML file") from None
+        problem = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise InputError(str(path), problem, "a TOML file") from None
     if len(content) > MAX_TOML_BYTES:
         raise InputError(str(path), f"larger than {MAX_TOML_BYTES} bytes", "a TOML file")
     return parse_toml(text, str(path))

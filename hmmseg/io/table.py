@@ -124,6 +124,18 @@ def numbers(table: Table, name: str) -> np.ndarray:
     return values
 
 
+def holds_text(values: np.ndarray) -> bool:
+    """Whether a column has words and no numbers, such as a comment in every row."""
+    if values.dtype.kind not in "OUS":
+        return False
+    import pandas as pd
+
+    entries = pd.Series(values).dropna()
+    words = entries.map(lambda entry: isinstance(entry, str))
+    numeric = pd.Series(pd.to_numeric(entries, errors="coerce"))
+    return bool(entries.size and words.all() and numeric.isna().all())
+
+
 def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
     """A column of times (num_rows,) [s], and where its zero lies in ns since 1970 if it holds dates.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.rig import Rig
-from hmmseg.io.table import Table, check_unique, numbers, times
+from hmmseg.io.table import Table, check_unique, holds_text, numbers, times
 from hmmseg.io.task import SequenceTask, Task
 from hmmseg.io.units import LARGEST, LATEST, Column, measures, si_factor, source_of, unwrapped
 from hmmseg.tables import Tabled, listed
@@ -38,6 +39,8 @@ class Trial(Tabled):
         notes: what was found out while reading it.
         hidden: properties that this hand cannot reveal, with the reason.
         touch_sd: systematic uncertainty of the distance at which the fingers touch a block [m].
+        step: steps in which places across (or the opening) and up are recorded, if coarser than their noise,
+            else 0 [m].
         touches: times of touch and release known apart from forces, with their standard deviations [s].
         timing: (num_timesteps,) uncertainty of the time at which a force changes [s].
         inertia: (num_timesteps, 2), only of a wrist sensor, whose forces are halved between the fingers:
@@ -56,6 +59,7 @@ class Trial(Tabled):
     notes: tuple[str, ...] = ()
     hidden: dict[str, str] = field(default_factory=dict)
     touch_sd: float = 0.0
+    step: tuple[float, ...] = (0.0, 0.0)
     touches: tuple[tuple[float, float], ...] = ()
     timing: np.ndarray | None = None
     inertia: np.ndarray | None = None
@@ -127,11 +131,15 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
             raise InputError(f"{table.file}: column {name}", f"has {len(values)} rows",
                              f"{table.rows.size} as in the others")  # fmt: skip
     _check_names(table, columns, names, optional, task is not None)
+    more = () if task is not None or rig is None or rig.gripper else _of_more_fingers(table.names)
     t, origin = mapped_times(table, rig)
     channels: dict[str, np.ndarray] = {}
     if names is None:  # all channels of a plain task, by our names where they are mapped
         mapped = {source_of(name, columns): name for name in columns}
-        names = tuple(mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t")
+        ours = {name: mapped.get(name, name) for name in table.names if mapped.get(name, name) != "t"}
+        text = [name for name in ours if name not in mapped and holds_text(table.columns[name])]
+        more = tuple(f"{table.file}: column {name} holds text, and is left out" for name in text)
+        names = tuple(own for name, own in ours.items() if name not in text)
     for name in names:
         theirs = source_of(name, columns)
         if theirs not in table.columns:
@@ -150,7 +158,7 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
         name: table.interpolated[source_of(name, columns)]
         for name in channels if source_of(name, columns) in table.interpolated
     }  # fmt: skip
-    return Trial(table.file, t, channels, origin, between, warnings=table.notes)
+    return Trial(table.file, t, channels, origin, between, warnings=(*table.notes, *more))
 
 
 def mapped_times(table: Table, rig: Rig | None) -> tuple[np.ndarray, int | None]:
@@ -177,6 +185,21 @@ def channels_of(rig: Rig | None, task: SequenceTask | None) -> tuple[tuple[str, 
     return (*CARTESIAN_CHANNELS, ROLL), (*CARTESIAN_OPTIONAL, ROLL)
 
 
+def _finger(name: str) -> int:
+    """Number of the finger whose channel has this name, 0 of any other."""
+    found = re.fullmatch(r"[vf]?[xy](\d)|d?q(\d)[12]", name)
+    return 0 if found is None else int(found.group(1) or found.group(2))
+
+
+def _of_more_fingers(names: tuple[str, ...]) -> tuple[str, ...]:
+    """A warning about columns that are named as those of a third finger."""
+    found = [name for name in names if _finger(name) > 2]
+    if not found:
+        return ()
+    return (f"columns {', '.join(found)} are left out: hands have two fingers here, and what a third bears "
+            "is missing from weights",)  # fmt: skip
+
+
 def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,
                  optional: tuple[str, ...], plain: bool) -> None:  # fmt: skip
     where = table.file
@@ -196,6 +219,10 @@ def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, 
         if ours == "t":
             raise InputError(f"{where}: column t", "missing",
                              f"a header row with a column t of times in s, {MAPPED}")  # fmt: skip
+        if not plain and _finger(ours) == 2 and not any(_finger(name) == 2 for name in table.names):
+            raise InputError(f"{where}: column {theirs}", "missing, as all of finger 2",
+                             f"two fingers, or a gripper with a wrist sensor ([gripper]), {MAPPED}"
+                             )  # fmt: skip
         expected = nearest(theirs, table.names) if plain else f"{', '.join(('t', *(names or ())))}, {MAPPED}"
         raise InputError(f"{where}: column {theirs}", "missing", expected)
     if names is None and len(table.names) < 2:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -13,6 +14,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.hmm.chain import Chain
 from hmmseg.hmm.inference import align
+from hmmseg.io.formats.delimited import find_layout, rows_in
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.sequence.courses import (
@@ -39,13 +41,14 @@ from hmmseg.sequence.emissions import (
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures, feature_map, features
 from hmmseg.sequence.model import NamedCourse, SequenceModel, optional_states, usual_misfit
 
-Labels = Mapping[str, Any]  # known boundaries [s] by name of the trial, as users give them
+Labels = Any  # known boundaries [s] as users give them: see `read_labels`
 HALVES = (0.0075, 0.02, 0.05)  # prior: half a window, as a share of a trial's length
 WEIGHTS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # prior: of templates; held-out labels choose
 STATE_WEIGHTS = (0.03, 0.2, 1.0)  # prior: of the emissions next to them, likewise
 FORGIVING = 1e-4  # prior: least probability of a held-out label, so that one odd label does not decide
 LEAST_PROBABLE = 0.002  # numerics: courses less probable than this are dropped
 MOST_KEPT = 16  # numerics: courses in a model
+COLUMNS = ("trial", "subtask", "start")  # of a table of labels
 ENOUGH = 2  # numerics: fully labelled trials for boundary templates: one is left out to weigh them
 
 
@@ -55,8 +58,7 @@ def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | N
     Args:
         trials: recordings, labelled or not; unlabelled ones contribute too.
         task: the order of the subtasks.
-        labels: by a trial's name (with or without its suffix) its boundaries [s], one fewer than subtasks,
-            None where unknown, or {subtask: its start}; a skipped optional subtask has two equal ones.
+        labels: as `read_labels` takes them; None of no trial.
 
     Returns:
         The fitted model.
@@ -75,32 +77,122 @@ def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | N
         if len(each.values) < 2 * len(task.sequence):
             raise InputError(trial.file, f"has {len(each.values)} samples",
                              f"at least two for each of {len(task.sequence)} subtasks")  # fmt: skip
-    boundaries = read_labels(trials, task, labels or {})
+    boundaries = read_labels(trials, task, labels)
     labelled = sum(np.isfinite(b).all() for b in boundaries) >= ENOUGH
     learned = _fit_labelled if labelled and len(task.sequence) > 1 else _fit_unlabelled
     return learned(data, task, mapping, boundaries)
 
 
 def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:
-    """Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown; InputError for invalid labels."""
-    stems = [Path(trial.file).stem for trial in trials]
-    for name in labels:
-        if (count := stems.count(Path(name).stem)) > 1:
-            raise InputError("labels", f"{name} names {count} trials", "one of each name")
-    given = [labels.get(stem, labels.get(t.name)) for stem, t in zip(stems, trials, strict=True)]
-    if labels and all(each is None for each in given):
-        raise InputError("labels", f"none is for these trials (there are {', '.join(sorted(labels))})",
-                         f"names such as {stems[0]}")  # fmt: skip
+    """Known boundaries of each trial.
+
+    Args:
+        trials: recordings of the task.
+        task: the order of the subtasks.
+        labels: one entry for each trial, or entries by the trials' names (with or without suffix), or a
+            folder or table for `label_files`. An entry holds boundaries [s], one fewer than subtasks, None
+            where unknown, or {subtask: its start}; a skipped optional subtask has two equal ones. None: no
+            label.
+
+    Returns:
+        Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown.
+
+    Raises:
+        InputError: labels that are none of these trials', or do not fit the task.
+    """
+    if isinstance(labels, str | Path):
+        labels = label_files(Path(labels), trials)
+    if isinstance(labels, Mapping):
+        for name in labels:
+            if (count := sum(_is_named(name, trial) for trial in trials)) > 1:
+                raise InputError("labels", f"{name} names {count} trials", "one of each name, or a list")
+        given = [next((labels[n] for n in labels if _is_named(n, trial)), None) for trial in trials]
+        if labels and all(each is None for each in given):
+            raise InputError("labels", f"none is for these trials (there are {', '.join(sorted(labels))})",
+                             f"names such as {trials[0].stem}")  # fmt: skip
+    else:
+        given = [None] * len(trials) if labels is None else list(labels)
+        if len(given) != len(trials):
+            raise InputError("labels", f"are {len(given)} for {len(trials)} trials",
+                             "one entry for each, None where unknown, or a dict by their names")  # fmt: skip
     unknown = np.full(len(task.sequence) - 1, np.nan)
     return [unknown if each is None else _check_labels(each, trial, task)
             for each, trial in zip(given, trials, strict=True)]  # fmt: skip
 
 
+def _is_named(name: str, trial: Trial) -> bool:
+    return trial.stem in (name, Path(name).stem) or name == trial.name
+
+
+def label_files(where: Path, trials: Sequence[Trial]) -> dict[str, Any]:
+    """Labels by trial, from a folder or a table.
+
+    Args:
+        where: a folder with NAME.json for some of the trials, {"boundaries": [times in s, null where
+            unknown]}, or a table (CSV, TSV in any dialect) with the columns trial, subtask and start [s].
+        trials: the trials.
+
+    Returns:
+        Entries for `read_labels` by the trials' names.
+
+    Raises:
+        InputError: there are no labels, they cannot be read, or they are of other trials.
+    """
+    if where.is_dir():
+        files = {trial.name: where / f"{trial.stem}.json" for trial in trials}
+        out = {name: _boundaries(path) for name, path in files.items() if path.exists()}
+        if not out:
+            few = ", ".join(path.name for path in [*files.values()][:3])
+            raise InputError(f"labels {where}", "has labels for none of the trials", f"files like {few}")
+        return out
+    if not where.is_file() or where.suffix.lower() not in (".csv", ".tsv"):
+        problem = f"ends in {where.suffix!r}" if where.is_file() else "no such file or folder"
+        raise InputError(f"labels {where}", problem, "a folder or a .csv file")
+    found = {}
+    for given, starts in _table(where).items():
+        names = [trial.name for trial in trials if _is_named(given, trial)]
+        if not names:
+            raise InputError(str(where), f"labels {given!r}, which is none of the trials",
+                             f"one of {', '.join(trial.stem for trial in trials)}")  # fmt: skip
+        found |= {name: starts for name in names}
+    return found
+
+
+def _boundaries(path: Path) -> list[float | None]:
+    try:
+        given = json.loads(path.read_text(encoding="utf-8"))["boundaries"]
+        return [None if each is None else float(each) for each in given]
+    except (OSError, ValueError, TypeError, KeyError):
+        raise InputError(str(path), "cannot be read", '{"boundaries": [times in s]}') from None
+
+
+def _table(path: Path) -> dict[str, dict[str, float]]:
+    """Starts [s] by subtask by trial, from a table; names stay text, as `01` is no number."""
+    layout = find_layout(path)
+    for name in COLUMNS:
+        if name not in layout.names or not layout.rows.size:
+            found = f"has no column {name}" if layout.rows.size else "has no rows"
+            raise InputError(str(path), found, f"the columns {', '.join(COLUMNS)}")
+    out: dict[str, dict[str, float]] = {}
+    for number, cells in rows_in(path, layout):
+        trial, subtask, start = (cells[layout.names.index(name)].strip() for name in COLUMNS)
+        try:
+            time = float(start.replace(",", "."))
+        except ValueError:
+            raise InputError(f"{path}: row {number}", f"start {start!r}", "a time in s") from None
+        if subtask in out.setdefault(trial, {}):
+            raise InputError(f"{path}: row {number}", f"labels {subtask} of {trial} again", "one start each")
+        out[trial][subtask] = time
+    return out
+
+
 def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     where, names = f"labels of {trial.file}", task.sequence[1:]
     if isinstance(given, Mapping):
+        first = given.get(task.sequence[0])  # begins with the recording
+        at_start = isinstance(first, int | float) and first <= trial.t[0]
         for name in given:
-            if names.count(name) != 1:
+            if names.count(name) != 1 and not (name == task.sequence[0] and at_start):
                 why = "comes more than once" if name in names else "has none in this task"
                 raise InputError(where, f"gives the start of {name!r}, which {why}",
                                  f"one of {', '.join(names)}, or a list of boundaries")  # fmt: skip

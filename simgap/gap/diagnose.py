@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from estimation.consistency import check_motion
 from hmmseg.contact.decompose import PROPERTIES, UNITS, subtasks
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
@@ -326,12 +327,15 @@ def diagnose(
         identified: Properties identified from the same trials, if known.
 
     Raises:
-        InputError: No trial fits its task, or a forced effect is unknown or cannot act on these recordings.
+        InputError: No trial fits its task, positions contradict velocities, or a forced effect is unknown or
+            cannot act on these recordings.
     """
     tell = progress or silent
     forced = tuple(effect_named(name).name for name in dict.fromkeys(forced))
     if of_wrist([one.trial for one in aligned.trials]):
         check_forced(forced)
+    else:
+        check_motion(aligned)
     found = search(aligned, actual, excluded, forced, tell, identified)
     tell("attributing the gap")
 

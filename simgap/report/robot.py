@@ -7,10 +7,10 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import BaseModel
 from scipy.stats import norm
 
 from hmmseg.errors import InputError
@@ -133,6 +133,18 @@ def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return out
 
 
+class _Known(BaseModel):
+    mean: float | None
+    interval_90: tuple[float, float] | None
+
+
+class _Run(BaseModel):
+    """A line of a history."""
+
+    date: str
+    parameters: dict[str, _Known]
+
+
 def history(path: Path) -> list[dict[str, Any]]:
     """The runs in a history file, one line of JSON each; none if there is no file.
 
@@ -144,28 +156,12 @@ def history(path: Path) -> list[dict[str, Any]]:
     out = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
         try:
-            entry = json.loads(line)
+            _Run.model_validate_json(line, strict=True)
         except ValueError:
-            entry = None
-        if not _is_run(entry):
             where = f"--history {path}: line {number}"
-            raise InputError(where, "is no run of a history", '{"date": .., "parameters": ..}')
-        out.append(entry)
+            raise InputError(where, "is no run of a history", '{"date": .., "parameters": ..}') from None
+        out.append(json.loads(line))
     return out
-
-
-def _is_run(entry: Any) -> bool:
-    """Whether a line has a date, and for each parameter a mean and an interval, or null."""
-    if not (isinstance(entry, dict) and isinstance(entry.get("date"), str)):
-        return False
-    known = entry.get("parameters")
-    number = (int, float, NoneType)
-    return isinstance(known, dict) and all(
-        isinstance(p, dict)
-        and isinstance(p.get("mean"), number)
-        and (p.get("interval_90") is None or np.shape(p["interval_90"]) == (2,))
-        for p in known.values()
-    )
 
 
 def compared(

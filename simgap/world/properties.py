@@ -86,7 +86,10 @@ def blocks_of(table: Mapping[str, Any], task: BlockTask, where: str) -> dict[str
 def _block(entry: Any, where: str) -> Block:
     if not isinstance(entry, dict):
         raise InputError(where, "missing", "weight, width and height of every object of the task")
-    values = {name: _value(entry.get(name), f"{where}.{name}", unit) for name, unit in UNITS.items()}
+    for name in UNITS:
+        if name not in entry:
+            raise InputError(f"{where}.{name}", "missing", f"a number in {UNITS[name]}")
+    values = {name: _value(entry[name], f"{where}.{name}", unit) for name, unit in UNITS.items()}
     return Block(**values, friction=_friction(entry.get("friction"), f"{where}.friction"))
 
 

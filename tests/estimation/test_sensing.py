@@ -20,6 +20,7 @@ from hmmseg.hand.sensing import remove_faults
 from hmmseg.io.formats import read_table
 from hmmseg.io.rig import read_rig
 from hmmseg.io.trial import trial_of
+from simgap import simulate
 
 FORCES = ("fx1", "fy1", "fx2", "fy2")
 RATES = ("dq11", "dq12", "dq21", "dq22")
@@ -144,6 +145,23 @@ def test_a_rig_that_is_no_such_hand_is_named_and_no_number_hangs_on_it(name):
     rig, (alter, named) = tomllib.loads((FOLDER / "rig.toml").read_text()), RIGS[name]
     alter(rig)
     assert_no_number_misleads(identify(TABLE, FOLDER / "task.toml", rig), named)
+
+
+def test_a_block_put_down_beside_its_support_tells_no_height():
+    rig = {"fingertip": {"normal_stiffness": 4000.0, "shear_stiffness": 2500.0},
+           "noise": {"position": 2e-5, "velocity": 3e-3, "force": 0.012}}  # fmt: skip
+    made = simulate(FOLDER / "task.toml", rig, seed=2)[0]
+    trial, (start, end) = made.trial, made.boundaries[5:7]  # while block2 is carried
+    aside = 0.1 * np.clip((trial.t - start) / (end - start), 0.0, 1.0)
+    table = {"t": trial.t} | {name: values for name, values in trial.channels.items() if name[0] != "v"}
+    table |= {name: table[name] + aside for name in ("x1", "x2")}
+    found = identify(table, FOLDER / "task.toml", rig)
+    assert re.match(r"block2 stands \d+ mm beside block1, on which", found.reasons["block1.height"])
+    assert ("block1", "width") in found.names and ("block2", "weight") in found.names
+    whole = {"t": trial.t} | {name: values for name, values in trial.channels.items() if name[0] != "v"}
+    early = (trial.t > made.boundaries[0]) & (trial.t < made.boundaries[3])  # block1 is moved unseen
+    unseen = identify(whole | {"x1": np.where(early, np.nan, whole["x1"])}, FOLDER / "task.toml", rig)
+    assert not any("beside" in text for text in unseen.reasons.values())
 
 
 @pytest.mark.parametrize("kind", ("balance", "room"))

@@ -98,6 +98,13 @@ def test_a_folder_a_loop_and_nothing_are_no_file(suffix, tmp_path):
         assert str(path) in told(reader, path)
 
 
+def test_a_table_without_a_header(tmp_path):
+    text, line = "1.0,2.0\n1.1,2.1\n", "but the first row holds numbers"
+    (tmp_path / "trial.csv").write_text(text)
+    assert line in told(READERS["trial"], tmp_path / "trial.csv")
+    assert line in told(Rows, io.BytesIO(text.encode()), Watcher(TASK, parse_rig({})))
+
+
 @pytest.mark.parametrize("read", ["rig", "task"])
 @pytest.mark.parametrize(
     "content",

@@ -1,6 +1,7 @@
 """Plain ordered tasks on recordings with planted boundaries."""
 
 import dataclasses
+import json
 from functools import cache
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
-from hmmseg.sequence.fit import fit_sequence
+from hmmseg.sequence.fit import fit_sequence, read_labels
 from hmmseg.sequence.model import load_model, save_model
 from hmmseg.sequence.segment import segment_sequence
 
@@ -233,6 +234,32 @@ def test_files_that_are_no_models_are_refused(tmp_path):
 def test_bad_labels_are_refused(labels, message):
     with pytest.raises(InputError, match=message):
         fit_sequence([record(0)[0]], TASK, labels)
+
+
+def test_labels_in_order_or_from_files_are_those_by_name(tmp_path):
+    data = recordings(4)
+    trials, truth = [t for t, _ in data], [b.tolist() for _, b in data]
+    expected = read_labels(trials, TASK, {"trial_0": truth[0], "trial_2.csv": truth[2]})
+    in_order = [truth[0], None, truth[2], None]
+    starts = {n: dict(zip(TASK.sequence[1:], truth[n], strict=True)) for n in (0, 2)}
+    rows = [(f"trial_{n}", name, at) for n, mine in starts.items() for name, at in mine.items()]
+    lines = [("trial", "subtask", "start"), *[(a, b, repr(c)) for a, b, c in rows]]
+    for name, text in {
+        "comma.csv": "\ufeff# ours\n" + "".join(",".join(line) + "\n" for line in lines),
+        "semicolon.csv": "".join(";".join(line).replace(".", ",") + "\n" for line in lines),
+        "tab.tsv": "".join("\t".join(line) + "\n" for line in lines),
+    }.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        np.testing.assert_array_equal(read_labels(trials, TASK, tmp_path / name), expected)
+    for n in (0, 2):
+        (tmp_path / f"trial_{n}.json").write_text(json.dumps({"boundaries": truth[n]}))
+    np.testing.assert_array_equal(read_labels(trials, TASK, str(tmp_path)), expected)
+    np.testing.assert_array_equal(read_labels(trials, TASK, in_order), expected)
+    whole = {"trial_0": {"wait": 0.0} | starts[0]}
+    np.testing.assert_array_equal(read_labels(trials, TASK, whole)[0], expected[0])
+    np.testing.assert_array_equal(read_labels(trials, TASK, np.array(truth)), truth)
+    with pytest.raises(InputError, match="are 1 for 4 trials; expected one entry for each"):
+        read_labels(trials, TASK, truth[:1])
 
 
 def test_bad_trials_are_refused():

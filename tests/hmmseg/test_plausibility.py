@@ -106,6 +106,44 @@ def test_forces_of_another_size_are_remarked_on(factor, unit):
     assert any(f'unit = "{unit}"' in warning for warning in warnings), warnings
 
 
+def test_a_hand_that_stands_still_is_not_taken_for_one_in_km():
+    rng = np.random.default_rng(0)
+    still = {name: np.full(80, np.nanmean(values)) + 2e-5 * rng.standard_normal(80)
+             for name, values in CARTESIAN.items()} | {"t": 0.05 * np.arange(80)}  # fmt: skip
+    assert not read_trial(still, FREE).warnings
+    tiny = changed(CARTESIAN, x=1e-3, y=1e-3, vx=1e-3, vy=1e-3)
+    assert any("as if they were in km" in line for line in read_trial(tiny, FREE).warnings)
+
+
+def test_a_position_that_repeats_itself_exchanges_no_axes():
+    trial = read_trial({**CARTESIAN, "x1": np.full_like(CARTESIAN["x1"], 0.1)}, FREE)
+    assert any("x1 reads 0.1 in every row" in line for line in trial.warnings)
+
+
+def test_positions_in_coarse_steps_are_told_and_not_taken_for_stuck():
+    rounded = {name: np.round(values, 3) if name[0] in "xy" else values for name, values in CARTESIAN.items()}
+    trial = read_trial(rounded, parse_rig({"noise": {"position": 2e-5}}))
+    assert any("in steps of 1 mm" in line for line in trial.warnings) and trial.step == pytest.approx(
+        (1e-3, 1e-3)
+    )
+    assert not any(re.match(r".*: [xy]\d repeats", line) for line in trial.warnings)
+    assert read_trial(CARTESIAN, FREE).step == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("names", "line"), [({"x2", "y2", "vx2", "vy2", "fx2", "fy2"}, "as all of finger 2"), (set(), "")]
+)
+def test_hands_of_other_than_two_fingers_are_told(names, line):
+    table = {k: v for k, v in CARTESIAN.items() if k not in names} | {"fx3": CARTESIAN["fx2"]}
+    if line:
+        with pytest.raises(InputError, match=line):
+            read_trial(table, FREE)
+    else:
+        assert any(
+            "columns fx3 are left out: hands have two fingers" in w for w in read_trial(table, FREE).warnings
+        )
+
+
 def test_y_that_points_down_is_told():
     (line,) = read_trial(changed(CARTESIAN, y=-1, vy=-1, fy=-1), FREE).warnings
     assert re.search("column y1 every hold first goes down .*y points down; expected y1 = ", line)

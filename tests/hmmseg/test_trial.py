@@ -397,6 +397,15 @@ def test_iso_stamps(tmp_path):
     assert trial.origin == stamps[0].astype("datetime64[ns]").astype(int)
 
 
+def test_a_column_of_words_is_no_channel_of_a_plain_task(tmp_path):
+    frame = pd.DataFrame({"t": T, "x": np.sin(T), "note": "fine", "when": pd.Timestamp("2026-01-01")})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    for source in (tmp_path / "a.csv", frame.drop(columns="when")):
+        trial = read_trial(source, task=SequenceTask(("a", "b")))
+        assert set(trial.channels) == {"x"}
+        assert any("column note holds text, and is left out" in line for line in trial.warnings)
+
+
 def test_only_wanted_columns_are_read(tmp_path):
     (tmp_path / "a.csv").write_text(written())
     table = read_table(tmp_path / "a.csv", ["t", "absent"])

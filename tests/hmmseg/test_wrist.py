@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from estimation import identify
 from estimation.identification import identify_aligned
 from experiments.wrist import ARM_RIG, SETUPS
 from experiments.wrist_scene import BLOCKS, TASK, Setup, performances, wrist_recording, wrist_rig
@@ -158,6 +159,7 @@ def test_a_missing_sample_is_bridged(performed):
         (Setup(heading=0.3), {}, {"qw": 2.0}, "a quaternion of norm .*expected a norm of 1"),
         (PLAIN, {}, {"t": 1e3}, r't = \{from = "t", unit = "ms"\}'),
         (PLAIN, {}, {"gap": 1e-6}, "expected a gripper that closes and opens"),
+        (PLAIN, {}, {"Fz": 0.0}, "column Fz: reads -?0 in every row; expected readings of a working sensor"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line):
@@ -168,6 +170,24 @@ def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line
     with pytest.raises(InputError, match=line) as told:
         read_trial(columns, rig)
     assert "\n" not in str(told.value)
+
+
+def test_a_place_that_never_changes_is_an_axis_without_motion(performed):
+    columns = wrist_recording(performed[0], PLAIN)
+    usual = read_trial(columns, wrist_rig(PLAIN))
+    still = read_trial(columns | {"px": np.full_like(columns["px"], 0.5)}, wrist_rig(PLAIN))
+    np.testing.assert_allclose(still.channels["fy1"], usual.channels["fy1"], atol=0.05)
+
+
+@pytest.mark.parametrize("step", [4e-4, 1e-3])
+def test_an_opening_in_coarse_steps_leaves_widths_uncertain_and_not_wrong(performed, step):
+    columns = wrist_recording(performed[0], PLAIN)
+    trial = read_trial(columns | {"gap": np.round(columns["gap"] / step) * step}, wrist_rig(PLAIN))
+    assert any(f"gap in steps of {1e3 * step:g} mm" in line for line in trial.warnings)
+    found = identify(trial, TASK, wrist_rig(PLAIN))
+    for name, block in BLOCKS.items():
+        width = found.of(name, "width")
+        assert abs(width.mean() - block.width) < 3 * width.std()
 
 
 def test_the_lift_tells_the_sign_where_readings_change_with_the_pose(performed):

@@ -3,8 +3,10 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -85,6 +87,8 @@ def test_what_is_wrong_with_one_recording_is_one_line(lab, capfd, tmp_path):
         (["--workers", "1", "--method", "qualitative"], "--workers, --scheduler: go with --json alone"),
         (["--workers", "0"], "Invalid value for '--workers'"),
         (["--scheduler", "nowhere"], "--scheduler nowhere: no scheduler answers there"),
+        (["--workers", "1", "--force-threshold", "0.1"], "go only with the paper's thresholds"),
+        (["--workers", "1", "--write", "labelled.txt"], "--write labelled.txt: unknown kind of file"),
     ],
 )
 def test_refusals(lab, more, said, capfd, monkeypatch):
@@ -145,6 +149,18 @@ class KilledWorker(Exception):
 
 
 KilledWorker.__module__ = "distributed.scheduler"
+
+
+@pytest.mark.parametrize("moment", [1.0, 2.0, 3.5])
+def test_ctrl_c_ends_all_workers_without_a_traceback(lab, moment):
+    command = [sys.executable, "-m", "hmmseg_cli", "segment", "many", "--task", "task.toml", "--rig",
+               "rig.toml", "--json", "stopped.json", "--workers", "2"]  # fmt: skip
+    running = subprocess.Popen(command, stdout=-1, stderr=-1, text=True, start_new_session=True)
+    time.sleep(moment)
+    os.killpg(running.pid, signal.SIGINT)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode in (130, -signal.SIGINT) and not err
+    assert not (lab / "stopped.json").exists()
 
 
 @pytest.mark.parametrize("error", [BrokenProcessPool(), CancelledError(), KilledWorker()])

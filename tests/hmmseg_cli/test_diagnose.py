@@ -7,6 +7,7 @@ import subprocess
 import tomllib
 from types import SimpleNamespace as NS
 
+import pandas as pd
 import pytest
 from demo_recordings import FOLDER
 from rich.console import Console
@@ -26,6 +27,21 @@ def test_effects_are_listed_with_priors(tmp_path, capsys):
     assert [p["name"] for p in bias["parameters"]] == ["fx1", "fy1", "fx2", "fy2"]
     assert bias["parameters"][0]["unit"] == "N"
     assert "force_bias" in capsys.readouterr().out
+
+
+def test_scales_that_contradict_each_other_are_told_before_any_search(tmp_path):
+    slow = pd.read_csv(FOLDER / "trial_01.csv").assign(t=lambda table: 1.25 * table.t)
+    rig = tomllib.loads((FOLDER / "rig.toml").read_text())
+    line = r"times as far as their velocities carry them.*; expected t = \{from = .t., unit = 0.8"
+    with pytest.raises(hmmseg.InputError, match=line):
+        hmmseg.diagnose(slow, FOLDER / "task.toml", {k: v for k, v in rig.items() if k != "rate"})
+
+
+def test_no_trial_is_its_own_healthy_one(capsys):
+    hand = ["--task", str(FOLDER / "task.toml"), "--rig", str(FOLDER / "rig.toml")]
+    trial = str(FOLDER / "trial_01.csv")
+    assert main(["diagnose", trial, *hand, "--healthy", trial]) == 2
+    assert "the same trial as" in capsys.readouterr().err
 
 
 def test_the_next_experiment_says_what_it_promises():

@@ -193,6 +193,20 @@ def test_without_a_reader_the_work_is_kept_and_said(stdout, lab):
         assert run.stderr.startswith("standard output: cannot be written to") and "out.json" in run.stderr
 
 
+def test_without_a_reader_of_json_a_line_says_so(lab):
+    command = shlex.join([*PROCESS, "decompose", "task.toml", "--json", "-", "--quiet"])
+    run = subprocess.run(["bash", "-c", f"{command} > /dev/full"], capture_output=True, text=True)
+    assert run.returncode == 2 and run.stderr.startswith("standard output: cannot be written to (No space")
+
+
+def test_a_folder_that_refuses_files_is_named_with_the_file(lab, monkeypatch, capsys):
+    monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)
+    assert main(["decompose", "task.toml", "--json", "out.json"]) == 2
+    assert capsys.readouterr().err.startswith(f"--json out.json: {lab} cannot be written to")
+    assert main(["demo"]) == 2
+    assert capsys.readouterr().err.startswith(f"--report demo/report.html: {lab} cannot be written")
+
+
 def test_names_may_hold_what_a_file_system_allows(lab, capsys):
     odd = os.fsdecode(b"caf\xe9\x1b[31m.csv")
     shutil.copyfile("trial.csv", odd)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,6 +53,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
 
     layout = find_layout(path)
     names = [name for name in layout.names if name]
+    check_header(names, str(path))
     check_unique(names, str(path))
     chosen = [i for i, name in enumerate(layout.names) if name and (wanted is None or name in wanted)]
     frame = pd.read_csv(
@@ -159,6 +160,15 @@ def _layout(path: Path, encoding: str) -> Layout:
                   np.array(rows, dtype=int), most, tuple(notes))  # fmt: skip
 
 
+def rows_in(path: Path, layout: Layout) -> Iterator[tuple[int, list[str]]]:
+    """Number, from 1, and cells of each row, as text."""
+    kept = set(layout.rows.tolist())
+    with path.open(encoding=layout.encoding, newline="") as file:
+        for number, line in enumerate(file):
+            if number in kept:
+                yield number + 1, cells_of(line.rstrip("\r\n"), layout.separator)
+
+
 def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] | None:
     """The header, if a comment holds it (as `numpy.savetxt` writes it) and `line` is the first row of
     numbers.
@@ -173,6 +183,13 @@ def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] |
         if len(names) == len(cells) and not _numeric(names):
             return names
     return None
+
+
+def check_header(cells: Sequence[str], where: str) -> None:
+    """InputError for a header of numbers alone, as where there is none."""
+    if cells and _numeric(cells):
+        expected = "a header row with a column t of times in s, but the first row holds numbers"
+        raise InputError(f"{where}: column t", "missing", expected)
 
 
 def separator_of(line: str) -> str:
@@ -192,7 +209,7 @@ def cells_of(line: str, separator: str) -> list[str]:
     return line.split(separator)
 
 
-def _numeric(cells: list[str]) -> bool:
+def _numeric(cells: Sequence[str]) -> bool:
     return all(NUMBER.fullmatch(cell.strip().replace(",", ".")) for cell in cells)
 
 
