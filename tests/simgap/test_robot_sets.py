@@ -65,18 +65,19 @@ def test_bounds_hold_and_many_sets_are_as_each_alone(drawn):
     assert sets.held_out(("a",), 0).sum() > sets.held_out((), 0).sum() + 10
 
 
-def test_what_nearly_cancels_is_freed_from_a_bound_again():
-    """Three numbers along that act almost alike, within narrow bounds: by the solver of exact fits."""
+@pytest.mark.parametrize("count", [3, 6])
+def test_what_nearly_cancels_is_freed_from_a_bound_again(count: int):
+    """Numbers along that act almost alike, within narrow bounds: by the solver of exact fits."""
     rng = np.random.default_rng(1)
-    low, high = np.array([-2.2, 0.0, 0.0]), np.array([2.0, 2.0, 2.0])
+    low, high = np.array([-2.2, 0.0, 0.0, 0.0, 0.0, -2.0])[:count], np.full(count, 2.0)
     for _ in range(200):
-        columns = rng.standard_normal((60, 1)) + 0.1 * rng.standard_normal((60, 3))
-        residual = columns @ rng.uniform(-1, 1, 3) * 3 + 0.1 * rng.standard_normal(60)
+        columns = rng.standard_normal((60, 1)) + 0.1 * rng.standard_normal((60, count))
+        residual = columns @ rng.uniform(-1, 1, count) * 30 + 0.1 * rng.standard_normal(60)
         whole = 10 * np.column_stack([residual, columns])
         gram = (whole.T @ whole)[None, None]
         ends = np.append(-np.inf, low), np.append(np.inf, high)
-        sets = Sets((), gram, np.zeros((1, 1)), 3, (), (), *ends, -2.0)
-        best = least(gram[0, 0, 1:, 1:] + np.eye(3), gram[0, 0, 0, 1:], low, high)[0]
+        sets = Sets((), gram, np.zeros((1, 1)), count, (), (), *ends, -2.0)
+        best = least(gram[0, 0, 1:, 1:] + np.eye(count), gram[0, 0, 0, 1:], low, high)[0]
         np.testing.assert_allclose(sets.fit((), 0).x, best, atol=1e-9)
 
 
