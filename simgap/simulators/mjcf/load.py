@@ -112,8 +112,10 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
         if hasattr(body, "simple"):
             body.simple = False
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if not np.any((plain.geom_contype != 0) | (plain.geom_conaffinity != 0)):
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # an eighth of a small robot's time
     model = compiled(spec)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     simulator, warnings = _simulator(model, described, str(map_file), address)
     simulator.spec = spec
     whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
@@ -197,9 +199,7 @@ def _simulator(
     if idle:
         names = ", ".join(name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
         warnings.append(f"{file}: no column drives {names}; they are left at zero or the keyframe")
-    touching = bool(np.any((model.geom_contype != 0) | (model.geom_conaffinity != 0))) and not (
-        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
-    )
+    touching = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     whole = {name: pose for name, pose in poses.items() if len(pose) == len(POSE)}
     made = MjcfSimulator(model, described, channels, {}, {}, sensors, joints, driven, free, touching, whole)
     return made, warnings
