@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student
 
+from simgap.attribution.verdict import RULED_OUT
 from simgap.latest import latest
 from simgap.progress import Progress, say
 from simgap.robot_effects.base import RobotEffect
@@ -52,7 +53,7 @@ JOINED = " against "
 NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
-SETTLED = 0.3  # numerics: nats to which the best set is fitted in the end, as three rule others out
+SETTLED = 0.3  # numerics: nats to which the leading sets are fitted in the end, as three rule one out
 NEAR_BY = 20.0  # numerics: nats of the best set within which others are fitted to the end
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
@@ -149,9 +150,12 @@ class Search:
         return self._settled(best)
 
     def _settled(self, best: FittedSet) -> FittedSet:
-        """The best set, fitted to the end."""
-        if best.promise > best.score + SETTLED:
-            best = self.fit(best.names, best.point, [best.whiten])
+        """The best set, and those that may be no worse, fitted to the end: three nats rule others out."""
+        near = (s for s in self.fitted.values() if s.promise > best.score - np.log(RULED_OUT))
+        for one in sorted(near, key=lambda one: -one.promise):
+            if one.promise > one.score + SETTLED:
+                self.fit(one.names, one.point, [one.whiten])
+        best = self.fitted[frozenset(best.names)]
         leading = max(self.fitted.values(), key=lambda one: one.score)
         return self._with_less(leading) if self._is_better(leading, best) else best
 
@@ -249,12 +253,13 @@ class Search:
         for whiten in scales:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
-                before, (there, bend) = one.score, self._begun_anew(one)
+                before, (there, linear, bend) = one.score, self._begun_anew(one)
                 leading = max((known.score for known in self.fitted.values()), default=before)
                 bent = bend > BETTER and before + bend > leading - NEAR_BY
                 if not bent and one.promise < max(before + BETTER, rival - NEAR):
                     break
-                one = max((one, self._fit_again(there, one)), key=lambda fitted: fitted.score)
+                again = self._judge(there, names, fit_effects(there, linear, one.whiten, one.point))
+                one = max((one, again), key=lambda fitted: fitted.score)
                 if one.score < before + BETTER:
                     break
             best = one if best is None or one.score > best.score else best
@@ -265,27 +270,22 @@ class Search:
             self.fitted[key] = best
         return self.fitted[key]
 
-    def _begun_anew(self, one: FittedSet) -> tuple[Composed, float]:
-        """The model about a set's fit, with windows run from where that puts their starts; and by how much
+    def _begun_anew(self, one: FittedSet) -> tuple[Composed, Linear, float]:
+        """The model with windows run from where a set's fit puts their starts, the gap there, and by how much
         straight lines from where they were run from are wrong there [nats]."""
         composed, linear, asides = one.composed, one.linear, {}
         for k, sizes in one.covariances.starts(one.whiten, np.nan_to_num(linear.residual)).items():
             away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
             asides[k] = {n: float(doubt * size) for (n, doubt), size in away if n != JUMPS}
         if not any(asides.values()):
-            return composed.moved(one.point), 0.0
+            return composed.moved(one.point), linear, 0.0
         there = composed.run_aside(asides)
-        off = linearise(there, one.point, [], linear.starts).residual - linear.residual
-        return there.moved(one.point), 0.5 * float(np.sum(one.whiten(np.nan_to_num(off)) ** 2))
+        anew = linearise(there, one.point, [], linear.starts)
+        off = one.whiten(np.nan_to_num(anew.residual - linear.residual))
+        return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
 
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
         return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)
-
-    def _fit_again(self, composed: Composed, one: FittedSet) -> FittedSet:
-        """A set fitted further, whitened by what it leaves and by how errors of starts grow from there."""
-        linear = linearise(composed, one.point, [])
-        whiten = covariances(composed, linear).whitener(one.discrepancy, one.wide)
-        return self._judge(composed, one.names, fit_effects(composed, linear, whiten, one.point))
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).

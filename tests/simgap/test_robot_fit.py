@@ -1,5 +1,7 @@
 """Exact fits come to planted values from wrong starts, and sets are judged by the discrepancy they leave."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -59,6 +61,17 @@ def test_what_is_settled_stays(damped):
     assert first.score > nothing.score + 100
     again = search.fit(("viscous",), first.point, [first.whiten])
     assert abs(again.score - first.score) < BETTER
+
+
+def test_rivals_are_fitted_to_the_end_before_they_are_ruled_out(damped, monkeypatch):
+    search, again = Search(damped, tuple(damped.effects), damped.rows.log), []
+    best = search.nothing()
+    for name, score, promise in (("near", -4.0, -1.0), ("far", -9.0, -4.0), ("settled", -2.0, -2.0)):
+        one = replace(best, names=(name,), score=best.score + score, promise=best.score + promise)
+        search.fitted[frozenset(one.names)] = one
+    monkeypatch.setattr(search, "fit", lambda names, *_: again.append(names))
+    assert search._settled(best) is best
+    assert again == [("near",)]
 
 
 class Two:
