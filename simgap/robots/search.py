@@ -485,14 +485,18 @@ class Search:
         return self._densities[one, by]
 
     def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
-        """Whether to go on from a set: it is likelier, and drops causes or predicts held-out logs better.
+        """Whether to go on from a set: it is likelier and has fewer causes, or as many of fewer parameters; or
+        it is so much likelier that it predicts held-out logs better.
 
         The judge is what the likelier set leaves: next to a discrepancy of twenty times the noise, a cause
         that explains it all hardly shows.
         """
-        if one.score <= best.score + BETTER:
-            return False
-        return {*one.names} < {*best.names} or predicts_better(self.gains(one, best, one))
+        if {*one.names} < {*best.names} or one.score <= best.score:
+            return one.score > best.score
+        gains = self.gains(one, best, one)
+        if len(one.names) == len(best.names) and sum(one.sets.size) < sum(best.sets.size):
+            return not predicts_better(-gains)
+        return one.score > best.score + BETTER and predicts_better(gains)
 
     def _take_apart(self, names: Names, point: dict) -> Names:
         """The set with joint candidates taken apart, and its point likewise, in place."""

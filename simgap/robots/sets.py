@@ -226,8 +226,8 @@ def _within(
 ) -> np.ndarray:
     """The x (B, m) within bounds (B, m) that minimise x' matrix x / 2 - pull x.
 
-    `side` (B, m): the bound at which each coordinate is thought to be, -1 low, 1 high; corrected in place. All
-    are solved at once, and those that this does not settle one by one.
+    `side` (B, m): the bound at which each coordinate is thought to be, -1 low, 1 high; corrected in place.
+    All are solved at once, and those that this does not settle one by one.
     """
     out, open_ = np.empty_like(pull), np.arange(len(pull))
     for _ in range(PIVOTS):
