@@ -21,7 +21,6 @@ from scipy.stats import t as student
 from simgap.attribution.verdict import RULED_OUT
 from simgap.latest import latest
 from simgap.progress import Progress, say
-from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration
 from simgap.robots.fit import fit_effects, prior_cost
 from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, with_wobble
@@ -30,7 +29,6 @@ from simgap.robots.sets import (
     Identifiability,
     Names,
     Sets,
-    cancelling,
     identifiability,
     neighbours,
     pairs,
@@ -39,7 +37,6 @@ from simgap.robots.sets import (
 )
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
 from simgap.robots.windows import JUMPS, STRIKES
-from simgap.simulators.protocol import Parameter
 
 EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which sets are scored
@@ -49,7 +46,6 @@ LEADERS = 16  # numerics: candidates that are rolled out where they fit best
 USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
-JOINED = " against "
 NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
@@ -58,7 +54,6 @@ NEAR_BY = 20.0  # numerics: nats of the best set within which others are fitted 
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
 BY_CHANCE = 0.05  # chosen: of sets that predict held-out folds no better, the share that may be said to
-MANY = 80  # numerics: candidates up to which all pairs are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +102,9 @@ class Search:
 
     `composed`: the model along the windows that are compared; `wanted`: names of the candidates; `fold`: fold
     (N,) of each row; `calibrated`: fits what nobody measured, from the model as it comes; called where a gap
-    is left; `calibration`: its result; `fitted`: all fitted sets, each at its best; `against`: joint
-    candidates (see `_joint`): how much of the second goes against one of the first; `columns`: candidates
-    as they were rolled out where the search began; None of one that diverged; `identifiable`: which
-    candidates' parameters the logs tell apart; `diverged`: candidates that diverge.
+    is left; `calibration`: its result; `fitted`: all fitted sets, each at its best; `columns`: candidates as
+    they were rolled out where the search began; None of one that diverged; `identifiable`: which candidates'
+    parameters the logs tell apart; `diverged`: candidates that diverge.
     """
 
     composed: Composed
@@ -119,7 +113,6 @@ class Search:
     calibrated: Callable[[], Calibration | None] = lambda: None
     calibration: Calibration | None = None
     fitted: dict[frozenset[str], FittedSet] = field(default_factory=dict)
-    against: dict[str, float] = field(default_factory=dict)
     columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
@@ -316,17 +309,10 @@ class Search:
             score += len(wide) * ALONE - 1e3 * linear.dropped
         return FittedSet(composed, names, point, linear, cov, discrepancy, wide, whiten, sets, score, promise)
 
-    def _sets(
-        self,
-        linear: Linear,
-        levels: Sequence[Whitener],
-        names: Sequence[str],
-        joint: Mapping[str, RobotEffect] | None = None,
-    ) -> Sets:
-        """The closed form for those of some candidates (and `joint` ones) that did not diverge."""
-        effects = {**self.composed.effects, **(joint or {})}
+    def _sets(self, linear: Linear, levels: Sequence[Whitener], names: Sequence[str]) -> Sets:
+        """The closed form for those of some candidates that did not diverge."""
         usable = [n for n in names if n in linear.moved]
-        return Sets.of(effects, linear, levels, usable, self.fold, self.log_odds)
+        return Sets.of(self.composed.effects, linear, levels, usable, self.fold, self.log_odds)
 
     def propose(self, at: FittedSet, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
         """Candidates about the point of a set, in closed form with its discrepancy and with less of it.
@@ -354,50 +340,7 @@ class Search:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
         linear = self._roll_out_leaders(composed, base, linear, sets, held)
-        linear, joint = self._joint(composed, base, linear, sets, held)
-        return self._sets(linear, levels, [*names, *joint], joint), levels
-
-    def _joint(
-        self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
-    ) -> tuple[Linear, dict[str, RobotEffect]]:
-        """Joint candidates of an encoder's misreading and its servo's command offset that nearly cancel.
-
-        The loop closes over the encoder, so that the joint is elsewhere and hardly a channel shows it. What
-        tells them is how each bends, which no straight line has, so they are rolled out along their
-        difference.
-        """
-        more, joint = {}, {}
-        for one, other, against in cancelling(sets, composed.effects):
-            name = f"{one}{JOINED}{other}"
-            if one in held or other in held or not np.isfinite(against) or abs(against) > FAR:
-                continue
-            if name not in self.columns:
-                self.against[name] = against
-                self.columns[name] = self._difference(composed, base, one, other, against)
-            moved = self.columns[name]
-            if moved is not None:
-                more[name] = moved
-                joint[name] = _sized(name)
-        return linear.with_moved(more), joint
-
-    def _difference(
-        self, composed: Composed, base: Base, one: str, other: str, against: float
-    ) -> Moved | None:
-        """How a usual size of one effect together with `against` usual sizes of the other moves the rows;
-        None where bounds or a rollout forbid it."""
-        for sign in (1.0, -1.0):
-            point = dict(base.point)
-            for name, size in ((one, sign), (other, sign * against)):
-                ((short, p),) = self.composed.effects[name].parameters.items()
-                point[name] = {short: p.nominal + size * p.sd}
-                if not p.low <= point[name][short] <= p.high:
-                    break
-            else:
-                rows = base_at(composed, point).rows
-                if not np.isfinite(rows[np.isfinite(base.rows)]).all():
-                    return None
-                return Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
-        return None
+        return self._sets(linear, levels, names), levels
 
     def _roll_out_leaders(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
@@ -434,10 +377,8 @@ class Search:
         `at` is the best itself, or the best less one cause, whose replacements are then sought.
         """
         sets, levels = latest(self._proposed, at, lambda: self.propose(at, self.wanted))
-        names = [n for n in sets.names if n not in self.against]
         near = neighbours(at.names, sets.names)
-        if at is best and len(names) <= MANY:  # a replacement is a single effect
-            near += pairs(at.names, names)
+        near += pairs(at.names, sets.names) if at is best else []  # a replacement is a single effect
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
         own = max(sets.scores([at.names], level)[0] for level in range(len(levels)))
@@ -447,15 +388,14 @@ class Search:
         if at is not best:  # straight lines miss as much of a replacement as they miss of the best itself
             of_best = score.max(0)[[{*names} == {*best.names} for names in near]]
             least = min(0.0, *(of_best - own + at.score - best.score)) - NEAR
-        effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
         tried, wrong, found = 0, 0.0, best
         for k in np.argsort(-promised):
             # Two replacements are fitted to the end whatever straight lines promise: these may miss by more.
             learns = at is not best and tried < LEARNED
             if tried >= TRIED or (promised[k] < least and not learns):
                 break
-            begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
-            names = self._take_apart(near[k], begin)
+            names = near[k]
+            begin = point_of(self.composed.effects, sets.fit(names, level[k]), names, self.along)
             if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                 continue
             scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
@@ -485,8 +425,8 @@ class Search:
         return self._densities[one, by]
 
     def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
-        """Whether to go on from a set: it is likelier and has fewer causes, or as many of fewer parameters; or
-        it is so much likelier that it predicts held-out logs better.
+        """Whether to go on from a set: it is likelier and has fewer causes, or as many with fewer parameters;
+        or it is much likelier and predicts held-out logs better.
 
         The judge is what the likelier set leaves: next to a discrepancy of twenty times the noise, a cause
         that explains it all hardly shows.
@@ -498,20 +438,6 @@ class Search:
             return not predicts_better(-gains)
         return one.score > best.score + BETTER and predicts_better(gains)
 
-    def _take_apart(self, names: Names, point: dict) -> Names:
-        """The set with joint candidates taken apart, and its point likewise, in place."""
-        out: list[str] = []
-        for name in names:
-            if name not in self.against:
-                out.append(name)
-                continue
-            size = point.pop(name)["size"]
-            for one, by in zip(name.split(JOINED), (size, size * self.against[name]), strict=True):
-                ((short, p),) = self.composed.effects[one].parameters.items()
-                point[one] = {short: float(np.clip(p.nominal + by * p.sd, p.low, p.high))}
-                out.append(one)
-        return tuple(dict.fromkeys(out))
-
     def _exchange(self, best: FittedSet) -> FittedSet | None:
         """A better set without one of the best's causes, or with replacements for one."""
         for out in best.names:
@@ -521,11 +447,6 @@ class Search:
             if there is not None:
                 return there
         return None
-
-
-def _sized(name: str) -> RobotEffect:
-    """A joint candidate, whose one parameter is how much of both effects acts."""
-    return RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
 
 
 def _prior_constants(sizes: Sequence[int]) -> float:

@@ -31,8 +31,6 @@ from simgap.robots.whiten import Whitener
 
 TURNS = 6  # numerics: iterations of reweighted least squares
 PIVOTS = 4  # numerics: exchanges of bounds for many sets at once
-ALIKE, SAME = 0.7, 0.99999  # numerics: correlations of columns that nearly cancel, and of equal ones
-SEEN = 1.0  # numerics: noise deviations by which a usual size must move all rows, together
 
 Names = tuple[str, ...]
 
@@ -290,27 +288,6 @@ def point_of(
 def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
     """A point without one effect."""
     return {n: v for n, v in point.items() if n != out}
-
-
-def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str, str, float]]:
-    """Pairs of a read-out and a command effect, of one parameter each, whose columns nearly cancel.
-
-    Returns:
-        Both names, and how many usual sizes of the second cancel one of the first.
-    """
-    single = [j for j, k in enumerate(sets.size) if k == 1]
-    at = np.array([sets.first[j] + 1 for j in single], int)
-    product = sets.gram[-1].sum(0)[np.ix_(at, at)]
-    length = np.sqrt(np.diag(product))
-    seen = length > SEEN
-    alike = product / np.where(np.outer(seen, seen), np.outer(length, length), np.inf)
-    found = []
-    for i, j in zip(*np.triu_indices(len(at), 1), strict=True):
-        one, other = sets.names[single[i]], sets.names[single[j]]
-        closed = {(e.alter is not None, e.command is not None) for e in (effects[one], effects[other])}
-        if closed == {(True, False), (False, True)} and ALIKE < abs(alike[i, j]) < SAME:
-            found.append((one, other, float(-alike[i, j] * length[i] / length[j])))
-    return found
 
 
 # Identifiability: which parameters these logs determine, and which only jointly.

@@ -304,6 +304,38 @@ def test_smoothed_commands_are_means_with_their_neighbours(files):
     assert np.abs(run() - plain()).max() > 1e-3
 
 
+FINGERS = """<mujoco>
+  <worldbody>
+    <body><joint name="left" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/></body>
+    <body pos="0.1 0 0"><joint name="right" type="slide" axis="-1 0 0"/><geom size="0.01" mass="0.1"/></body>
+    <body pos="0.2 0 0"><joint name="tip"/><geom size="0.01" mass="0.1"/></body>
+  </worldbody>
+  <equality>
+    <joint joint1="right" joint2="left" polycoef="0.01 2 0 0 0"/>
+    <joint joint1="tip" joint2="right" polycoef="0 0 3 0 0"/>
+  </equality>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("seen", ["left", "right"])
+def test_joints_without_a_column_follow_their_equality(files, seen):
+    found = load_mjcf(*files(FINGERS, f'[columns.w]\njoint = "{seen}"\n'))
+    t, (left, right) = np.arange(0, 1, 0.01), (0.02, 0.05)
+    start = {"left": (left, 0.1), "right": (right, 0.2)}[seen]
+    job = Job(
+        {}, Recording("a.csv", t, {"w": np.zeros(t.size)}), dict(zip(("w", "w_rate"), start, strict=True))
+    )
+    _, *state = found.simulator._states([job])[0]
+    np.testing.assert_allclose(state, [left, right, 3 * right**2, 0.1, 0.2, 6 * right * 0.2])
+    assert not found.warnings
+
+
+def test_joints_that_nothing_shows_are_said(files):
+    found = load_mjcf(*files(FINGERS, '[columns.w]\njoint = "tip"\n'))
+    assert "no column shows left, right, which the model moves as it runs freely" in found.warnings[0]
+
+
 @pytest.mark.parametrize(("place", "at"), [("", 0.2), ('payload_at = {arm = "tool"}\n', 0.2),
                                            ("payload_at = {arm = [0.1, 0.0, 0.0]}\n", 0.1)])  # fmt: skip
 def test_a_payload_is_a_point_mass_where_it_is_said_to_be(files, place, at):

@@ -1,6 +1,5 @@
 """Evidence of sets in closed form against integrals, and what whitens rows against what it says it is."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,7 @@ from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.search import predicts_better
-from simgap.robots.sets import Sets, cancelling, neighbours, pairs
+from simgap.robots.sets import Sets, neighbours, pairs
 from simgap.robots.verdict import _absurd
 from simgap.robots.whiten import Block, Covariances, Discrepancy, Source
 
@@ -79,19 +78,6 @@ def test_what_nearly_cancels_is_freed_from_a_bound_again(count: int):
         sets = Sets((), gram, np.zeros((1, 1)), count, (), (), *ends, -2.0)
         best = least(gram[0, 0, 1:, 1:] + np.eye(count), gram[0, 0, 0, 1:], low, high)[0]
         np.testing.assert_allclose(sets.fit((), 0).x, best, atol=1e-9)
-
-
-def test_what_an_encoder_and_a_command_do_against_each_other_is_found(drawn):
-    columns, residual, fold = drawn
-    columns[:, 2] = -2.0 * columns[:, 1] + 0.1 * columns[:, 2]
-    parameter, same = {"x": Parameter(0.0, 1.0)}, lambda *values: values[-2]
-    read, moved = RobotEffect("", "", parameter, alter=same), RobotEffect("", "", parameter, command=same)
-    sets = sets_of(columns, residual, fold)
-    ((one, other, against),) = cancelling(sets, {"a": read, "b": moved, "c": moved})
-    assert (one, other) == ("a", "b") and against == pytest.approx(0.5, rel=0.05)
-    assert not cancelling(sets, {"a": moved, "b": moved, "c": read})
-    sets = replace(sets, names=("a",), size=(2,))  # none of one parameter
-    assert not cancelling(sets, {"a": read})
 
 
 def block(window: int) -> Block:

@@ -17,7 +17,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.catalogue import offered
 from simgap.simulators.mjcf.engine import FREE, HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
-from simgap.simulators.mjcf.model import MjcfSimulator
+from simgap.simulators.mjcf.model import MjcfSimulator, ties
 from simgap.simulators.mjcf.setting import compiled, name_of, names_of, object_id, setting_of
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
@@ -195,6 +195,12 @@ def _simulator(
             missing = ", ".join(a for a in POSE if a not in pose)
             warnings.append(f"{file}: the free body {name} has no column for {missing}, so that it starts as "
                             "the model has it")  # fmt: skip
+    known = {*joints.values(), *(joint for joint, _, _ in ties(model, [*joints.values()]))}
+    moving = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE)))
+    if unseen := [name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
+        warnings.append(
+            f"{file}: no column shows {', '.join(unseen)}, which the model moves as it runs freely"
+        )
     idle = [i for i in range(model.nu) if i not in driven.values()]
     if idle:
         names = ", ".join(name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
