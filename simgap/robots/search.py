@@ -271,11 +271,11 @@ class Search:
             away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
             asides[k] = {n: float(doubt * size) for (n, doubt), size in away if n != JUMPS}
         if not any(asides.values()):
-            return composed.moved(one.point), linear, 0.0
+            return composed.moved(one.point, dear=False), linear, 0.0
         there = composed.run_aside(asides)
         anew = linearise(there, one.point, [], linear.starts)
         off = one.whiten(np.nan_to_num(anew.residual - linear.residual))
-        return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
+        return there.moved(one.point, dear=False), anew, 0.5 * float(np.sum(off**2))
 
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
         return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)

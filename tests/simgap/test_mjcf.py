@@ -169,6 +169,20 @@ def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, 
     np.testing.assert_allclose(log["q"], 2.0 * t, atol=1e-5)
 
 
+def test_goals_of_rates_in_degrees_are_told(files, tmp_path):
+    servo = XML.replace('<motor name="m" joint="pivot"/>', '<velocity name="m" joint="pivot" kv="9"/>')
+    found = load_mjcf(*files(servo, MAP.replace('unit = "Nm"', 'unit = "rad/s"')))
+    t, path = np.arange(0, 2, 0.01), tmp_path / "log.csv"
+    for goal in (np.cos(t), np.degrees(np.cos(t))):
+        rows = zip(t, np.sin(t), goal, strict=True)
+        path.write_text("t,q,u\n" + "".join(f"{a:.3f},{b:.6f},{c:.6f}\n" for a, b, c in rows))
+        if goal[0] == 1.0:
+            assert not found.read(path).warnings
+            continue
+        with pytest.raises(InputError, match=r"column u: .* rad/s of column q; expected unit = .deg/s. of u"):
+            found.read(path)
+
+
 def test_delayed_commands_step_when_they_are_carried_out(files):
     """The mean over each solver's step of what was commanded 12.3 ms before, by brute force."""
     found, log, effects = loaded(files)

@@ -255,25 +255,26 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
 
 
 def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
-    """InputError where a servo's goals are its joint's angles in other units; units are never guessed."""
+    """InputError where a servo's goals are its joint's angles or rates in other units; units are never
+    guessed."""
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
-        joint = int(model.actuator_trnid[a, 0])
-        servo = model.actuator_biasprm[a, 1] < 0 and joint in seen
-        if not servo or int(model.jnt_type[joint]) != HINGE:
+        joint, (_, stiff, damped) = int(model.actuator_trnid[a, 0]), model.actuator_biasprm[a, :3]
+        servo = stiff < 0 or -damped == model.actuator_gainprm[a, 0] > 0
+        if not servo or joint not in seen or int(model.jnt_type[joint]) != HINGE:
             continue
-        goal, angle = log[column], log[seen[joint]]
+        goal, there, per = log[column], seen[joint], "" if stiff < 0 else "/s"
+        angle = np.gradient(log[there], log.t) if per else log[there]
         both = np.isfinite(goal) & np.isfinite(angle)
         if not both.any() or not np.any(angle[both]):
             continue
         times = float(goal[both] @ angle[both] / (angle[both] @ angle[both]))
         for factor, unit in ((math.degrees(1), "deg"), (math.radians(1), "rad")):
             if abs(math.log(max(times, 1e-9) / factor)) < SAME:
-                ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} rad"
-                there = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} rad"
-                found = f"{ends}, and its joint is at {there} of column {seen[joint]}"
-                mend = f'unit = "{unit}" of {column} in the map?'
-                raise InputError(f"{file}: column {column}", found, mend)
+                ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} rad{per}"
+                shown = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} rad{per} of column {there}"
+                mend = f'unit = "{unit}{per}" of {column} in the map?'
+                raise InputError(f"{file}: column {column}", f"{ends}, and its joint is at {shown}", mend)
 
 
 SAME = math.log(2.0)  # limit: logarithm of the factor by which a servo may miss its goals
