@@ -198,7 +198,10 @@ class Search:
                     near_low = best.point[name][short] < 0.5 * (p.low + p.high)
                     other = {**best.point[name], short: p.high if near_low else p.low}
                     point = {**best.point, name: other}
-                    there = replace(best, composed=best.composed.moved(point), point=point)
+                    composed = best.composed.moved(point, dear=False)
+                    linear = linearise(composed, point, [*self.along, *best.names], best.linear.starts)
+                    cov = covariances(composed, linear)
+                    there = replace(best, composed=composed, point=point, linear=linear, covariances=cov)
                     sets, levels = self.propose(there, best.names)
                     score, k, begin = self._likeliest(sets, best.names)
                     if score > best.score + NEAR:
@@ -320,9 +323,8 @@ class Search:
         Candidates that do not act yet are varied by their usual size, for a joint that sticks follows no
         small change. They stay as they were where the search began; the leading ones are rolled out anew.
         """
-        composed, point, held = at.composed, at.point, at.names
-        linear = linearise(composed, point, [*self.along, *held], at.linear.starts)
-        base, more = base_at(composed, point), {}
+        composed, held = at.composed, at.names
+        base, more = base_at(composed, at.point), {}
         for name in names:
             if name not in held:
                 if name not in self.columns:
@@ -331,10 +333,9 @@ class Search:
                     self.columns[name] = vary(composed, base, name, step=size)
                 one = self.columns[name]
                 more |= {} if one is None else {name: one}
-        linear = linear.with_moved(more)
-        cov = covariances(composed, linear)
+        linear = at.linear.with_moved(more)
         scales = [{n: s * k for n, s in at.discrepancy.items()} for k in LEVELS if at.discrepancy]
-        levels = [cov.whitener(d, at.wide) for d in (*scales, NONE)]
+        levels = [at.covariances.whitener(d, at.wide) for d in (*scales, NONE)]
         sets = self._sets(linear, levels, names)
         if not held:
             self.identifiable = identifiability(*sets.product())
