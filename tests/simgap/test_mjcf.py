@@ -302,6 +302,21 @@ def turning(files, described: str = TURN, more: str = "", u: np.ndarray | None =
     return found, run
 
 
+@pytest.mark.parametrize("kind", ["position", "velocity"])
+def test_the_gain_of_a_servo_is_how_stiffly_it_follows(files, kind):
+    def run(stiff: float, **changed: float) -> np.ndarray:
+        number = {"position": "kp", "velocity": "kv"}[kind]
+        servo = SERVO.replace('<position name="servo" joint="turn" kp="40" kv="2"/>',
+                              f'<{kind} name="servo" joint="turn" {number}="{stiff}"/>')  # fmt: skip
+        found, _ = turning(lambda *given: files(servo % "", given[1]))
+        values = {n: s.nominal for n, s in found.simulator.settings.items()} | changed
+        log = Recording("a.csv", t, {"q": 0 * t, "u": 0.3 * np.sin(6 * t)})
+        return found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 1.8})["q"]
+
+    t = np.arange(0, 2, 0.01)
+    np.testing.assert_allclose(run(2.0, **{"actuator:servo.gain": -0.2}), run(1.6), atol=1e-9)
+
+
 def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
     found, run = turning(files)
     model = found.simulator.model

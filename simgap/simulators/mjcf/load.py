@@ -18,7 +18,14 @@ from simgap.simulators.mjcf.catalogue import offered
 from simgap.simulators.mjcf.engine import FREE, HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
 from simgap.simulators.mjcf.model import MjcfSimulator, ties
-from simgap.simulators.mjcf.setting import compiled, name_of, names_of, object_id, setting_of
+from simgap.simulators.mjcf.setting import (
+    compiled,
+    follows_rates,
+    name_of,
+    names_of,
+    object_id,
+    setting_of,
+)
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
 
@@ -259,11 +266,11 @@ def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
     guessed."""
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
-        joint, (_, stiff, damped) = int(model.actuator_trnid[a, 0]), model.actuator_biasprm[a, :3]
-        servo = stiff < 0 or -damped == model.actuator_gainprm[a, 0] > 0
+        joint, per = int(model.actuator_trnid[a, 0]), "/s" if follows_rates(model, a) else ""
+        servo = per or model.actuator_biasprm[a, 1] < 0
         if not servo or joint not in seen or int(model.jnt_type[joint]) != HINGE:
             continue
-        goal, there, per = log[column], seen[joint], "" if stiff < 0 else "/s"
+        goal, there = log[column], seen[joint]
         angle = np.gradient(log[there], log.t) if per else log[there]
         both = np.isfinite(goal) & np.isfinite(angle)
         if not both.any() or not np.any(angle[both]):
