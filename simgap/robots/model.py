@@ -113,11 +113,9 @@ class Composed:
                     out[self.effects[name].model[short]] = value
         return out
 
-    def moved(self, point: Point, dear: bool = True) -> Composed:
-        """The same with the derivatives by the simulator's own numbers taken at this point; the dear ones
-        only if asked for, as they change least."""
-        kept = {} if dear else {key: v for key, v in self._slopes.items() if self.effects[key[3]].dear}
-        return replace(self, about=dict(point), _slopes=kept)
+    def moved(self, point: Point) -> Composed:
+        """The same with the derivatives by the simulator's own numbers taken at this point."""
+        return replace(self, about=dict(point), _slopes={})
 
     def run_aside(self, asides: Mapping[int, Mapping[str, float]]) -> Composed:
         """The same with windows, by number, run that far aside of their starts."""

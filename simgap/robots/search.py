@@ -198,7 +198,7 @@ class Search:
                     near_low = best.point[name][short] < 0.5 * (p.low + p.high)
                     other = {**best.point[name], short: p.high if near_low else p.low}
                     point = {**best.point, name: other}
-                    composed = best.composed.moved(point, dear=False)
+                    composed = best.composed.moved(point)
                     linear = linearise(composed, point, [*self.along, *best.names], best.linear.starts)
                     cov = covariances(composed, linear)
                     there = replace(best, composed=composed, point=point, linear=linear, covariances=cov)
@@ -274,11 +274,11 @@ class Search:
             away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
             asides[k] = {n: float(doubt * size) for (n, doubt), size in away if n != JUMPS}
         if not any(asides.values()):
-            return composed.moved(one.point, dear=False), linear, 0.0
+            return composed.moved(one.point), linear, 0.0
         there = composed.run_aside(asides)
         anew = linearise(there, one.point, [], linear.starts)
         off = one.whiten(np.nan_to_num(anew.residual - linear.residual))
-        return there.moved(one.point, dear=False), anew, 0.5 * float(np.sum(off**2))
+        return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
 
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
         return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)

@@ -220,16 +220,6 @@ def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files
         loaded(files, "option.integratr")
 
 
-def test_what_costs_a_second_run_is_varied_once_while_a_fit_goes_on(files):
-    found, log, _ = loaded(files)
-    effects = candidates(Setting(found.simulator, [log]))
-    here, point = Composed.of(found.simulator, [log], effects, {"q": 1e-4}), {"option.hold": {"hold": 0.5}}
-    for name in ("timestep", "hold"):
-        here._slope(f"option.{name}", name)
-    assert {key[3] for key in here.moved(point, dear=False)._slopes} == {"option.timestep"}
-    assert not here.moved(point)._slopes
-
-
 @pytest.mark.parametrize(
     ("own", "name", "other"),
     [("RK4", "timestep", "Euler"), ("RK4", "integrator", "implicit"), ("Euler", "integrator", "implicit"),
