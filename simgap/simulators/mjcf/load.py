@@ -203,7 +203,7 @@ def _simulator(
             warnings.append(f"{file}: the free body {name} has no column for {missing}, so that it starts as "
                             "the model has it")  # fmt: skip
     known = {*joints.values(), *(joint for joint, _, _ in ties(model, [*joints.values()]))}
-    moving = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE)))
+    moving = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist()
     if unseen := [name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
         warnings.append(
             f"{file}: no column shows {', '.join(unseen)}, which the model moves as it runs freely"
