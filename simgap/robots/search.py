@@ -18,9 +18,9 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student
 
+from simgap.attribution.verdict import RULED_OUT
 from simgap.latest import latest
 from simgap.progress import Progress, say
-from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import Calibration
 from simgap.robots.fit import fit_effects, prior_cost
 from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, with_wobble
@@ -29,7 +29,6 @@ from simgap.robots.sets import (
     Identifiability,
     Names,
     Sets,
-    cancelling,
     identifiability,
     neighbours,
     pairs,
@@ -38,7 +37,6 @@ from simgap.robots.sets import (
 )
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
 from simgap.robots.windows import JUMPS, STRIKES
-from simgap.simulators.protocol import Parameter
 
 EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which sets are scored
@@ -48,16 +46,14 @@ LEADERS = 16  # numerics: candidates that are rolled out where they fit best
 USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
-JOINED = " against "
 NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
-SETTLED = 0.3  # numerics: nats to which the best set is fitted in the end, as three rule others out
+SETTLED = 0.3  # numerics: nats to which the leading sets are fitted in the end, as three rule one out
 NEAR_BY = 20.0  # numerics: nats of the best set within which others are fitted to the end
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
 BY_CHANCE = 0.05  # chosen: of sets that predict held-out folds no better, the share that may be said to
-MANY = 80  # numerics: candidates up to which all pairs are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +102,9 @@ class Search:
 
     `composed`: the model along the windows that are compared; `wanted`: names of the candidates; `fold`: fold
     (N,) of each row; `calibrated`: fits what nobody measured, from the model as it comes; called where a gap
-    is left; `calibration`: its result; `fitted`: all fitted sets, each at its best; `against`: joint
-    candidates (see `_joint`): how much of the second goes against one of the first; `columns`: candidates
-    as they were rolled out where the search began; None of one that diverged; `identifiable`: which
-    candidates' parameters the logs tell apart; `diverged`: candidates that diverge.
+    is left; `calibration`: its result; `fitted`: all fitted sets, each at its best; `columns`: candidates as
+    they were rolled out where the search began; None of one that diverged; `identifiable`: which candidates'
+    parameters the logs tell apart; `diverged`: candidates that diverge.
     """
 
     composed: Composed
@@ -118,7 +113,6 @@ class Search:
     calibrated: Callable[[], Calibration | None] = lambda: None
     calibration: Calibration | None = None
     fitted: dict[frozenset[str], FittedSet] = field(default_factory=dict)
-    against: dict[str, float] = field(default_factory=dict)
     columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
@@ -149,9 +143,12 @@ class Search:
         return self._settled(best)
 
     def _settled(self, best: FittedSet) -> FittedSet:
-        """The best set, fitted to the end."""
-        if best.promise > best.score + SETTLED:
-            best = self.fit(best.names, best.point, [best.whiten])
+        """The best set, and those that may be no worse, fitted to the end: three nats rule others out."""
+        near = (s for s in self.fitted.values() if s.promise > best.score - np.log(RULED_OUT))
+        for one in sorted(near, key=lambda one: -one.promise):
+            if one.promise > one.score + SETTLED:
+                self.fit(one.names, one.point, [one.whiten])
+        best = self.fitted[frozenset(best.names)]
         leading = max(self.fitted.values(), key=lambda one: one.score)
         return self._with_less(leading) if self._is_better(leading, best) else best
 
@@ -201,7 +198,10 @@ class Search:
                     near_low = best.point[name][short] < 0.5 * (p.low + p.high)
                     other = {**best.point[name], short: p.high if near_low else p.low}
                     point = {**best.point, name: other}
-                    there = replace(best, composed=best.composed.moved(point), point=point)
+                    composed = best.composed.moved(point)
+                    linear = linearise(composed, point, [*self.along, *best.names], best.linear.starts)
+                    cov = covariances(composed, linear)
+                    there = replace(best, composed=composed, point=point, linear=linear, covariances=cov)
                     sets, levels = self.propose(there, best.names)
                     score, k, begin = self._likeliest(sets, best.names)
                     if score > best.score + NEAR:
@@ -249,12 +249,13 @@ class Search:
         for whiten in scales:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
-                before, (there, bend) = one.score, self._begun_anew(one)
+                before, (there, linear, bend) = one.score, self._begun_anew(one)
                 leading = max((known.score for known in self.fitted.values()), default=before)
                 bent = bend > BETTER and before + bend > leading - NEAR_BY
                 if not bent and one.promise < max(before + BETTER, rival - NEAR):
                     break
-                one = max((one, self._fit_again(there, one)), key=lambda fitted: fitted.score)
+                again = self._judge(there, names, fit_effects(there, linear, one.whiten, one.point))
+                one = max((one, again), key=lambda fitted: fitted.score)
                 if one.score < before + BETTER:
                     break
             best = one if best is None or one.score > best.score else best
@@ -265,27 +266,22 @@ class Search:
             self.fitted[key] = best
         return self.fitted[key]
 
-    def _begun_anew(self, one: FittedSet) -> tuple[Composed, float]:
-        """The model about a set's fit, with windows run from where that puts their starts; and by how much
+    def _begun_anew(self, one: FittedSet) -> tuple[Composed, Linear, float]:
+        """The model with windows run from where a set's fit puts their starts, the gap there, and by how much
         straight lines from where they were run from are wrong there [nats]."""
         composed, linear, asides = one.composed, one.linear, {}
         for k, sizes in one.covariances.starts(one.whiten, np.nan_to_num(linear.residual)).items():
             away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
             asides[k] = {n: float(doubt * size) for (n, doubt), size in away if n != JUMPS}
         if not any(asides.values()):
-            return composed.moved(one.point), 0.0
+            return composed.moved(one.point), linear, 0.0
         there = composed.run_aside(asides)
-        off = linearise(there, one.point, [], linear.starts).residual - linear.residual
-        return there.moved(one.point), 0.5 * float(np.sum(one.whiten(np.nan_to_num(off)) ** 2))
+        anew = linearise(there, one.point, [], linear.starts)
+        off = one.whiten(np.nan_to_num(anew.residual - linear.residual))
+        return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
 
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
         return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)
-
-    def _fit_again(self, composed: Composed, one: FittedSet) -> FittedSet:
-        """A set fitted further, whitened by what it leaves and by how errors of starts grow from there."""
-        linear = linearise(composed, one.point, [])
-        whiten = covariances(composed, linear).whitener(one.discrepancy, one.wide)
-        return self._judge(composed, one.names, fit_effects(composed, linear, whiten, one.point))
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).
@@ -316,17 +312,10 @@ class Search:
             score += len(wide) * ALONE - 1e3 * linear.dropped
         return FittedSet(composed, names, point, linear, cov, discrepancy, wide, whiten, sets, score, promise)
 
-    def _sets(
-        self,
-        linear: Linear,
-        levels: Sequence[Whitener],
-        names: Sequence[str],
-        joint: Mapping[str, RobotEffect] | None = None,
-    ) -> Sets:
-        """The closed form for those of some candidates (and `joint` ones) that did not diverge."""
-        effects = {**self.composed.effects, **(joint or {})}
+    def _sets(self, linear: Linear, levels: Sequence[Whitener], names: Sequence[str]) -> Sets:
+        """The closed form for those of some candidates that did not diverge."""
         usable = [n for n in names if n in linear.moved]
-        return Sets.of(effects, linear, levels, usable, self.fold, self.log_odds)
+        return Sets.of(self.composed.effects, linear, levels, usable, self.fold, self.log_odds)
 
     def propose(self, at: FittedSet, names: Sequence[str]) -> tuple[Sets, list[Whitener]]:
         """Candidates about the point of a set, in closed form with its discrepancy and with less of it.
@@ -334,9 +323,8 @@ class Search:
         Candidates that do not act yet are varied by their usual size, for a joint that sticks follows no
         small change. They stay as they were where the search began; the leading ones are rolled out anew.
         """
-        composed, point, held = at.composed, at.point, at.names
-        linear = linearise(composed, point, [*self.along, *held], at.linear.starts)
-        base, more = base_at(composed, point), {}
+        composed, held = at.composed, at.names
+        base, more = base_at(composed, at.point), {}
         for name in names:
             if name not in held:
                 if name not in self.columns:
@@ -345,59 +333,15 @@ class Search:
                     self.columns[name] = vary(composed, base, name, step=size)
                 one = self.columns[name]
                 more |= {} if one is None else {name: one}
-        linear = linear.with_moved(more)
-        cov = covariances(composed, linear)
+        linear = at.linear.with_moved(more)
         scales = [{n: s * k for n, s in at.discrepancy.items()} for k in LEVELS if at.discrepancy]
-        levels = [cov.whitener(d, at.wide) for d in (*scales, NONE)]
+        levels = [at.covariances.whitener(d, at.wide) for d in (*scales, NONE)]
         sets = self._sets(linear, levels, names)
         if not held:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
         linear = self._roll_out_leaders(composed, base, linear, sets, held)
-        linear, joint = self._joint(composed, base, linear, sets, held)
-        return self._sets(linear, levels, [*names, *joint], joint), levels
-
-    def _joint(
-        self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
-    ) -> tuple[Linear, dict[str, RobotEffect]]:
-        """Joint candidates of an encoder's misreading and its servo's command offset that nearly cancel.
-
-        The loop closes over the encoder, so that the joint is elsewhere and hardly a channel shows it. What
-        tells them is how each bends, which no straight line has, so they are rolled out along their
-        difference.
-        """
-        more, joint = {}, {}
-        for one, other, against in cancelling(sets, composed.effects):
-            name = f"{one}{JOINED}{other}"
-            if one in held or other in held or not np.isfinite(against) or abs(against) > FAR:
-                continue
-            if name not in self.columns:
-                self.against[name] = against
-                self.columns[name] = self._difference(composed, base, one, other, against)
-            moved = self.columns[name]
-            if moved is not None:
-                more[name] = moved
-                joint[name] = _sized(name)
-        return linear.with_moved(more), joint
-
-    def _difference(
-        self, composed: Composed, base: Base, one: str, other: str, against: float
-    ) -> Moved | None:
-        """How a usual size of one effect together with `against` usual sizes of the other moves the rows;
-        None where bounds or a rollout forbid it."""
-        for sign in (1.0, -1.0):
-            point = dict(base.point)
-            for name, size in ((one, sign), (other, sign * against)):
-                ((short, p),) = self.composed.effects[name].parameters.items()
-                point[name] = {short: p.nominal + size * p.sd}
-                if not p.low <= point[name][short] <= p.high:
-                    break
-            else:
-                rows = base_at(composed, point).rows
-                if not np.isfinite(rows[np.isfinite(base.rows)]).all():
-                    return None
-                return Moved(np.zeros(1), np.zeros(rows.size), sign * (rows - base.rows)[:, None])
-        return None
+        return self._sets(linear, levels, names), levels
 
     def _roll_out_leaders(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
@@ -434,10 +378,8 @@ class Search:
         `at` is the best itself, or the best less one cause, whose replacements are then sought.
         """
         sets, levels = latest(self._proposed, at, lambda: self.propose(at, self.wanted))
-        names = [n for n in sets.names if n not in self.against]
         near = neighbours(at.names, sets.names)
-        if at is best and len(names) <= MANY:  # a replacement is a single effect
-            near += pairs(at.names, names)
+        near += pairs(at.names, sets.names) if at is best else []  # a replacement is a single effect
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
         own = max(sets.scores([at.names], level)[0] for level in range(len(levels)))
@@ -447,15 +389,14 @@ class Search:
         if at is not best:  # straight lines miss as much of a replacement as they miss of the best itself
             of_best = score.max(0)[[{*names} == {*best.names} for names in near]]
             least = min(0.0, *(of_best - own + at.score - best.score)) - NEAR
-        effects = {**self.composed.effects, **{n: _sized(n) for n in self.against}}
         tried, wrong, found = 0, 0.0, best
         for k in np.argsort(-promised):
             # Two replacements are fitted to the end whatever straight lines promise: these may miss by more.
             learns = at is not best and tried < LEARNED
             if tried >= TRIED or (promised[k] < least and not learns):
                 break
-            begin = point_of(effects, sets.fit(near[k], level[k]), near[k], self.along)
-            names = self._take_apart(near[k], begin)
+            names = near[k]
+            begin = point_of(self.composed.effects, sets.fit(names, level[k]), names, self.along)
             if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                 continue
             scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
@@ -485,28 +426,18 @@ class Search:
         return self._densities[one, by]
 
     def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
-        """Whether to go on from a set: it is likelier, and drops causes or predicts held-out logs better.
+        """Whether to go on from a set: it is likelier and has fewer causes, or as many with fewer parameters;
+        or it is much likelier and predicts held-out logs better.
 
         The judge is what the likelier set leaves: next to a discrepancy of twenty times the noise, a cause
         that explains it all hardly shows.
         """
-        if one.score <= best.score + BETTER:
-            return False
-        return {*one.names} < {*best.names} or predicts_better(self.gains(one, best, one))
-
-    def _take_apart(self, names: Names, point: dict) -> Names:
-        """The set with joint candidates taken apart, and its point likewise, in place."""
-        out: list[str] = []
-        for name in names:
-            if name not in self.against:
-                out.append(name)
-                continue
-            size = point.pop(name)["size"]
-            for one, by in zip(name.split(JOINED), (size, size * self.against[name]), strict=True):
-                ((short, p),) = self.composed.effects[one].parameters.items()
-                point[one] = {short: float(np.clip(p.nominal + by * p.sd, p.low, p.high))}
-                out.append(one)
-        return tuple(dict.fromkeys(out))
+        if {*one.names} < {*best.names} or one.score <= best.score:
+            return one.score > best.score
+        gains = self.gains(one, best, one)
+        if len(one.names) == len(best.names) and sum(one.sets.size) < sum(best.sets.size):
+            return not predicts_better(-gains)
+        return one.score > best.score + BETTER and predicts_better(gains)
 
     def _exchange(self, best: FittedSet) -> FittedSet | None:
         """A better set without one of the best's causes, or with replacements for one."""
@@ -517,11 +448,6 @@ class Search:
             if there is not None:
                 return there
         return None
-
-
-def _sized(name: str) -> RobotEffect:
-    """A joint candidate, whose one parameter is how much of both effects acts."""
-    return RobotEffect(name, "", {"size": Parameter(0.0, 1.0)})
 
 
 def _prior_constants(sizes: Sequence[int]) -> float:

@@ -23,14 +23,14 @@ from itertools import combinations
 import numpy as np
 from scipy.special import gammaln
 
+from simgap.bounded import least
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.linear import Linear, Moved
 from simgap.robots.model import Point
 from simgap.robots.whiten import Whitener
 
 TURNS = 6  # numerics: iterations of reweighted least squares
-ALIKE, SAME = 0.7, 0.99999  # numerics: correlations of columns that nearly cancel, and of equal ones
-SEEN = 1.0  # numerics: noise deviations by which a usual size must move all rows, together
+PIVOTS = 4  # numerics: exchanges of bounds for many sets at once
 
 Names = tuple[str, ...]
 
@@ -195,19 +195,9 @@ class Sets:
         count, a = free.shape[1], self.along
         size = np.bincount(block, minlength=len(ordered[0]))
         prior, x = np.ones(free.shape), np.zeros(free.shape)
-        eye, side = np.eye(count), np.zeros(free.shape, int)  # side: -1 fixed low, 1 fixed high
+        eye, side = np.eye(count), np.zeros(free.shape, int)
         for _ in range(TURNS):
-            held = side != 0
-            at = np.where(side < 0, low, np.where(side > 0, high, 0.0))
-            rest = np.where(held, at, pull - np.einsum("bij,bj->bi", bend, at))
-            loose = ~(held[:, :, None] | held[:, None, :])
-            matrix = np.where(loose, bend + prior[:, :, None] * eye, eye)
-            x = np.linalg.solve(matrix, rest[..., None])[..., 0]
-            # As in `simgap.bounded`: what lies beyond a bound is fixed there, what is drawn inwards freed.
-            slope = np.einsum("bij,bj->bi", bend, x) + prior * x - pull
-            beyond = (x > high).astype(int) - (x < low)
-            side = np.where(held, np.where(side * slope > 0, 0, side), beyond)
-            x = np.clip(x, low, high)
+            x = _within(bend + prior[:, :, None] * eye, pull, low, high, side)
             if block.size:
                 square_x = np.stack([np.sum(x[:, a:][:, block == j] ** 2, 1) for j in range(size.size)], 1)
                 prior[:, a:] = ((1 + size) / (1 + square_x))[:, block]
@@ -227,6 +217,35 @@ class Sets:
             return score, x, np.zeros((0, 0, 0)), np.zeros((0, 0, 0))
         spread = np.linalg.inv(bend + prior[:, :, None] * eye)
         return score, x, np.linalg.inv(matrix) * loose, spread
+
+
+def _within(
+    matrix: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray, side: np.ndarray
+) -> np.ndarray:
+    """The x (B, m) within bounds (B, m) that minimise x' matrix x / 2 - pull x.
+
+    `side` (B, m): the bound at which each coordinate is thought to be, -1 low, 1 high; corrected in place.
+    All are solved at once, and those that this does not settle one by one.
+    """
+    out, open_ = np.empty_like(pull), np.arange(len(pull))
+    for _ in range(PIVOTS):
+        bend, mine, s = matrix[open_], pull[open_], side[open_]
+        at = np.where(s < 0, low[open_], np.where(s > 0, high[open_], 0.0))
+        rest = np.where(s != 0, at, mine - np.einsum("bij,bj->bi", bend, at))
+        free = (s == 0)[:, :, None] & (s == 0)[:, None, :]
+        x = np.linalg.solve(np.where(free, bend, np.eye(s.shape[1])), rest[..., None])[..., 0]
+        # As in `simgap.bounded`: what lies beyond a bound is fixed there, what is drawn inwards freed.
+        slope = np.einsum("bij,bj->bi", bend, x) - mine
+        beyond = (x > high[open_]).astype(int) - (x < low[open_])
+        new = np.where(s != 0, np.where(s * slope > 0, 0, s), beyond)
+        out[open_], side[open_] = x, new
+        open_ = open_[(new != s).any(1)]
+        if not open_.size:
+            return out
+    for b in open_:
+        out[b], held = least(matrix[b], pull[b], low[b], high[b])
+        side[b] = np.where(held, np.where(out[b] == low[b], -1, 1), 0)
+    return out
 
 
 def _columns(effect: RobotEffect, moved: Moved) -> list[np.ndarray]:
@@ -269,27 +288,6 @@ def point_of(
 def without(point: Point, out: str) -> dict[str, Mapping[str, float]]:
     """A point without one effect."""
     return {n: v for n, v in point.items() if n != out}
-
-
-def cancelling(sets: Sets, effects: Mapping[str, RobotEffect]) -> list[tuple[str, str, float]]:
-    """Pairs of a read-out and a command effect, of one parameter each, whose columns nearly cancel.
-
-    Returns:
-        Both names, and how many usual sizes of the second cancel one of the first.
-    """
-    single = [j for j, k in enumerate(sets.size) if k == 1]
-    at = np.array([sets.first[j] + 1 for j in single], int)
-    product = sets.gram[-1].sum(0)[np.ix_(at, at)]
-    length = np.sqrt(np.diag(product))
-    seen = length > SEEN
-    alike = product / np.where(np.outer(seen, seen), np.outer(length, length), np.inf)
-    found = []
-    for i, j in zip(*np.triu_indices(len(at), 1), strict=True):
-        one, other = sets.names[single[i]], sets.names[single[j]]
-        closed = {(e.alter is not None, e.command is not None) for e in (effects[one], effects[other])}
-        if closed == {(True, False), (False, True)} and ALIKE < abs(alike[i, j]) < SAME:
-            found.append((one, other, float(-alike[i, j] * length[i] / length[j])))
-    return found
 
 
 # Identifiability: which parameters these logs determine, and which only jointly.

@@ -160,14 +160,14 @@ def verdict_on(
     left = shares.remainder if far is None else max(1.0 - far.fraction, 0.0)
     doubts = _absurd(search.composed.effects, best, causes)
     if left > MOST:
-        doubts = (*doubts, f"{over_noise:.3g} times the noise is left")
+        doubts = (*doubts, f"it leaves {100 * left:.0f} % of the gap")
     right = 0.0 if doubts else known(left, 1.0 - left)
     others = _alternatives(search, best)
     # What is too small to report, and what could replace it, is no cause and replaces none.
     small = {*best.names} - {*causes}
     small |= {n for s in others if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
     sets = _explanations(others, best, small - {*causes}, right)
-    matters = bool(causes) or before > MATTERS * floor
+    matters = (bool(causes) and not doubts) or before > MATTERS * floor
     ordered = tuple(sorted(causes))
     verdict = conclude(sets, gap.p_value, matters, ordered if forced else (), ordered, record=RECORD)
     stands_in = {}

@@ -169,6 +169,20 @@ def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, 
     np.testing.assert_allclose(log["q"], 2.0 * t, atol=1e-5)
 
 
+def test_goals_of_rates_in_degrees_are_told(files, tmp_path):
+    servo = XML.replace('<motor name="m" joint="pivot"/>', '<velocity name="m" joint="pivot" kv="9"/>')
+    found = load_mjcf(*files(servo, MAP.replace('unit = "Nm"', 'unit = "rad/s"')))
+    t, path = np.arange(0, 2, 0.01), tmp_path / "log.csv"
+    for goal in (np.cos(t), np.degrees(np.cos(t))):
+        rows = zip(t, np.sin(t), goal, strict=True)
+        path.write_text("t,q,u\n" + "".join(f"{a:.3f},{b:.6f},{c:.6f}\n" for a, b, c in rows))
+        if goal[0] == 1.0:
+            assert not found.read(path).warnings
+            continue
+        with pytest.raises(InputError, match=r"column u: .* rad/s of column q; expected unit = .deg/s. of u"):
+            found.read(path)
+
+
 def test_delayed_commands_step_when_they_are_carried_out(files):
     """The mean over each solver's step of what was commanded 12.3 ms before, by brute force."""
     found, log, effects = loaded(files)
@@ -278,6 +292,21 @@ def turning(files, described: str = TURN, more: str = "", u: np.ndarray | None =
     return found, run
 
 
+@pytest.mark.parametrize("kind", ["position", "velocity"])
+def test_the_gain_of_a_servo_is_how_stiffly_it_follows(files, kind):
+    def run(stiff: float, **changed: float) -> np.ndarray:
+        number = {"position": "kp", "velocity": "kv"}[kind]
+        servo = SERVO.replace('<position name="servo" joint="turn" kp="40" kv="2"/>',
+                              f'<{kind} name="servo" joint="turn" {number}="{stiff}"/>')  # fmt: skip
+        found, _ = turning(lambda *given: files(servo % "", given[1]))
+        values = {n: s.nominal for n, s in found.simulator.settings.items()} | changed
+        log = Recording("a.csv", t, {"q": 0 * t, "u": 0.3 * np.sin(6 * t)})
+        return found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 1.8})["q"]
+
+    t = np.arange(0, 2, 0.01)
+    np.testing.assert_allclose(run(2.0, **{"actuator:servo.gain": -0.2}), run(1.6), atol=1e-9)
+
+
 def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
     found, run = turning(files)
     model = found.simulator.model
@@ -302,6 +331,38 @@ def test_smoothed_commands_are_means_with_their_neighbours(files):
     _, run = turning(files, u=u)
     np.testing.assert_allclose(run(option__smooth=0.3), plain(), atol=1e-12)
     assert np.abs(run() - plain()).max() > 1e-3
+
+
+FINGERS = """<mujoco>
+  <worldbody>
+    <body><joint name="left" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/></body>
+    <body pos="0.1 0 0"><joint name="right" type="slide" axis="-1 0 0"/><geom size="0.01" mass="0.1"/></body>
+    <body pos="0.2 0 0"><joint name="tip"/><geom size="0.01" mass="0.1"/></body>
+  </worldbody>
+  <equality>
+    <joint joint1="right" joint2="left" polycoef="0.01 2 0 0 0"/>
+    <joint joint1="tip" joint2="right" polycoef="0 0 3 0 0"/>
+  </equality>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("seen", ["left", "right"])
+def test_joints_without_a_column_follow_their_equality(files, seen):
+    found = load_mjcf(*files(FINGERS, f'[columns.w]\njoint = "{seen}"\n'))
+    t, (left, right) = np.arange(0, 1, 0.01), (0.02, 0.05)
+    start = {"left": (left, 0.1), "right": (right, 0.2)}[seen]
+    job = Job(
+        {}, Recording("a.csv", t, {"w": np.zeros(t.size)}), dict(zip(("w", "w_rate"), start, strict=True))
+    )
+    _, *state = found.simulator._states([job])[0]
+    np.testing.assert_allclose(state, [left, right, 3 * right**2, 0.1, 0.2, 6 * right * 0.2])
+    assert not found.warnings
+
+
+def test_joints_that_nothing_shows_are_said(files):
+    found = load_mjcf(*files(FINGERS, '[columns.w]\njoint = "tip"\n'))
+    assert "no column shows left, right, which the model moves as it runs freely" in found.warnings[0]
 
 
 @pytest.mark.parametrize(("place", "at"), [("", 0.2), ('payload_at = {arm = "tool"}\n', 0.2),

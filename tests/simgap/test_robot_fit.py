@@ -1,5 +1,8 @@
 """Exact fits come to planted values from wrong starts, and sets are judged by the discrepancy they leave."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,8 +13,9 @@ from simgap.robot_effects.base import Setting
 from simgap.robots.fit import _prior, _slope, fit_effects
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
-from simgap.robots.rows import noises
+from simgap.robots.rows import noises, phases_of
 from simgap.robots.search import BETTER, Search
+from simgap.robots.verdict import Shrinkage, verdict_on
 from simgap.robots.whiten import covariances
 from simgap.simulators.protocol import Channel, Parameter
 from simgap.simulators.recording import Recording
@@ -59,6 +63,42 @@ def test_what_is_settled_stays(damped):
     assert first.score > nothing.score + 100
     again = search.fit(("viscous",), first.point, [first.whiten])
     assert abs(again.score - first.score) < BETTER
+
+
+def test_rivals_are_fitted_to_the_end_before_they_are_ruled_out(damped, monkeypatch):
+    search, again = Search(damped, tuple(damped.effects), damped.rows.log), []
+    best = search.nothing()
+    for name, score, promise in (("near", -4.0, -1.0), ("far", -9.0, -4.0), ("settled", -2.0, -2.0)):
+        one = replace(best, names=(name,), score=best.score + score, promise=best.score + promise)
+        search.fitted[frozenset(one.names)] = one
+    monkeypatch.setattr(search, "fit", lambda names, *_: again.append(names))
+    assert search._settled(best) is best
+    assert again == [("near",)]
+
+
+@pytest.mark.parametrize(("gain", "better"), [(0.0, True), (9.0, True), (-9.0, False)])
+def test_of_what_explains_alike_the_simpler_is_preferred(damped, monkeypatch, gain, better):
+    search = Search(damped, tuple(damped.effects), damped.rows.log)
+    monkeypatch.setattr(search, "gains", lambda *_: np.full(4, gain))
+    one, two = (
+        SimpleNamespace(names=(n,), score=score, sets=SimpleNamespace(size=size))
+        for n, score, size in (("coulomb", 0.5, (1,)), ("stribeck", 0.0, (2,)))
+    )
+    assert search._is_better(one, two) is better
+    assert not search._is_better(two, one)
+
+
+def test_a_small_gap_whose_only_cause_is_doubted_is_none():
+    model = composed(Swing(), [log(s) for s in range(3)])
+    search = Search(model, tuple(model.effects), model.rows.log)
+    nothing = search.nothing()
+    best = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
+    best = replace(best, score=nothing.score + 20)
+    far = Shrinkage(1.0, 1.0, 1.0, 0.0, (0.0, 0.0), {}, *np.zeros((3, 1)))
+    phases = phases_of(model.simulator, model.recordings, model.windows)
+    found = verdict_on(search, best, far, phases, 0, False)
+    assert found.detection.p_value < 0.01 and found.doubts
+    assert (found.verdict, found.causes) == ("none", ())
 
 
 class Two:

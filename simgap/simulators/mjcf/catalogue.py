@@ -122,7 +122,7 @@ class _Catalogue:
         for a in sorted({*self.simulator.driven.values()}):
             name, head = name_of(m, "actuator", a), f"actuator:{name_of(m, 'actuator', a)}"
             if m.actuator_gainprm[a, 0]:
-                says = f"gain of {name} (of a servo, its stiffness)"
+                says = f"gain of {name} (of a servo, how stiffly it follows)"
                 self.add(f"{head}.gain", SIZE, says, low=-0.9)
                 sd = SIZE * abs(float(m.actuator_biasprm[a, 2]))
                 self.add(f"{head}.damping", sd, f"velocity gain of {name}", low=0.0)

@@ -17,8 +17,15 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.catalogue import offered
 from simgap.simulators.mjcf.engine import FREE, HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
-from simgap.simulators.mjcf.model import MjcfSimulator
-from simgap.simulators.mjcf.setting import compiled, name_of, names_of, object_id, setting_of
+from simgap.simulators.mjcf.model import MjcfSimulator, ties
+from simgap.simulators.mjcf.setting import (
+    compiled,
+    follows_rates,
+    name_of,
+    names_of,
+    object_id,
+    setting_of,
+)
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
 
@@ -112,8 +119,10 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
         if hasattr(body, "simple"):
             body.simple = False
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if not np.any((plain.geom_contype != 0) | (plain.geom_conaffinity != 0)):
+        spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # an eighth of a small robot's time
     model = compiled(spec)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     simulator, warnings = _simulator(model, described, str(map_file), address)
     simulator.spec = spec
     whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
@@ -193,13 +202,17 @@ def _simulator(
             missing = ", ".join(a for a in POSE if a not in pose)
             warnings.append(f"{file}: the free body {name} has no column for {missing}, so that it starts as "
                             "the model has it")  # fmt: skip
+    known = {*joints.values(), *(joint for joint, _, _ in ties(model, [*joints.values()]))}
+    moving = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist()
+    if unseen := [name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
+        warnings.append(
+            f"{file}: no column shows {', '.join(unseen)}, which the model moves as it runs freely"
+        )
     idle = [i for i in range(model.nu) if i not in driven.values()]
     if idle:
         names = ", ".join(name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
         warnings.append(f"{file}: no column drives {names}; they are left at zero or the keyframe")
-    touching = bool(np.any((model.geom_contype != 0) | (model.geom_conaffinity != 0))) and not (
-        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
-    )
+    touching = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     whole = {name: pose for name, pose in poses.items() if len(pose) == len(POSE)}
     made = MjcfSimulator(model, described, channels, {}, {}, sensors, joints, driven, free, touching, whole)
     return made, warnings
@@ -249,25 +262,26 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
 
 
 def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
-    """InputError where a servo's goals are its joint's angles in other units; units are never guessed."""
+    """InputError where a servo's goals are its joint's angles or rates in other units; units are never
+    guessed."""
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
-        joint = int(model.actuator_trnid[a, 0])
-        servo = model.actuator_biasprm[a, 1] < 0 and joint in seen
-        if not servo or int(model.jnt_type[joint]) != HINGE:
+        joint, per = int(model.actuator_trnid[a, 0]), "/s" if follows_rates(model, a) else ""
+        servo = per or model.actuator_biasprm[a, 1] < 0
+        if not servo or joint not in seen or int(model.jnt_type[joint]) != HINGE:
             continue
-        goal, angle = log[column], log[seen[joint]]
+        goal, there = log[column], seen[joint]
+        angle = np.gradient(log[there], log.t) if per else log[there]
         both = np.isfinite(goal) & np.isfinite(angle)
         if not both.any() or not np.any(angle[both]):
             continue
         times = float(goal[both] @ angle[both] / (angle[both] @ angle[both]))
         for factor, unit in ((math.degrees(1), "deg"), (math.radians(1), "rad")):
             if abs(math.log(max(times, 1e-9) / factor)) < SAME:
-                ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} rad"
-                there = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} rad"
-                found = f"{ends}, and its joint is at {there} of column {seen[joint]}"
-                mend = f'unit = "{unit}" of {column} in the map?'
-                raise InputError(f"{file}: column {column}", found, mend)
+                ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} rad{per}"
+                shown = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} rad{per} of column {there}"
+                mend = f'unit = "{unit}{per}" of {column} in the map?'
+                raise InputError(f"{file}: column {column}", f"{ends}, and its joint is at {shown}", mend)
 
 
 SAME = math.log(2.0)  # limit: logarithm of the factor by which a servo may miss its goals

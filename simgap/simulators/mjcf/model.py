@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from hmmseg.robust import bridged
 from simgap.latest import latest
@@ -58,6 +59,7 @@ class MjcfSimulator:
         self._runs_of = Runs(self.model, self._data, self.channels, self.sensor, self.driven, self.free)
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
+        self._ties = ties(self.model, [*self.joints.values()])
         self._nominal = {n: s.nominal for n, s in self.settings.items()}
         self.uncertain, self.sd = self.map.uncertain, self.map.sd  # as the diagnosis asks for them
 
@@ -110,6 +112,7 @@ class MjcfSimulator:
         for column, (q, v) in self._places.items():
             state[1 + q] = job.start[column]
             state[1 + nq + v] = job.start[column + RATE]
+        self._tie(state)
         for joint, columns in self.free.items():
             q, v = 1 + int(self.model.jnt_qposadr[joint]), 1 + nq + int(self.model.jnt_dofadr[joint])
             place, turn = [columns[a] for a in POSE[:3]], [columns[a] for a in POSE[3:]]
@@ -123,6 +126,14 @@ class MjcfSimulator:
             state[v + 3 : v + 6] = body_rate(quat, rate - quat * (quat @ rate))
         return state
 
+    def _tie(self, state: np.ndarray) -> None:
+        """Put joints that follow others where these have them, in a full physics state, in place."""
+        m, q, v = self.model, state[1:], state[1 + self.model.nq :]
+        for joint, other, by in self._ties:
+            at, away = m.jnt_qposadr[joint], q[m.jnt_qposadr[other]] - m.qpos0[m.jnt_qposadr[other]]
+            q[at] = m.qpos0[at] + by(away)
+            v[m.jnt_dofadr[joint]] = by.deriv()(away) * v[m.jnt_dofadr[other]]
+
     def _own_state(self, log: Recording, whole: bool) -> np.ndarray:
         """The model's own start of a log; of a window, what its run of the whole log has reached."""
         if not whole and self._partial and log.name in self._runs:
@@ -131,6 +142,7 @@ class MjcfSimulator:
         for column, (q, _) in self._places.items():
             seen = log[column][np.isfinite(log[column])]
             state[1 + q] = seen[0] if seen.size else 0.0
+        self._tie(state)
         return state
 
     def _reset(self) -> np.ndarray:
@@ -162,7 +174,7 @@ class MjcfSimulator:
     @property
     def _partial(self) -> bool:
         """Whether no column determines some of the state."""
-        states = len(self.joints) + 6 * len(self.free)
+        states = len(self.joints) + len(self._ties) + 6 * len(self.free)
         return states < self.model.nv or self.model.na > 0
 
     def prepare(self, recordings: Sequence[Recording]) -> None:
@@ -216,6 +228,30 @@ class MjcfSimulator:
             return touching_pairs(self.model, data, poses, at)
 
         return latest(self._touched, (poses.shape, poses.tobytes()), made)
+
+
+def ties(model: Any, seen: Sequence[int]) -> list[tuple[int, int, Polynomial]]:
+    """Joints that no column shows but an equality has follow another, directly or not, that is `seen`.
+
+    Returns:
+        The joint, the other, and the polynomial of how far the other is from its reference that gives how far
+            the joint is from its own.
+    """
+    out, known = list[tuple[int, int, Polynomial]](), {*seen}
+    pairs = [
+        (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]), Polynomial(model.eq_data[k, :5]))
+        for k in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool))
+        if model.eq_obj2id[k] >= 0
+    ]
+    for _ in pairs:
+        for joint, other, by in pairs:
+            first, slope, *more = by.coef
+            if joint not in known and other in known:
+                out.append((joint, other, by))
+            elif other not in known and joint in known and slope and not any(more):
+                out.append((other, joint, Polynomial([-first / slope, 1 / slope])))
+            known |= {one for one, _, _ in out}
+    return out
 
 
 def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | None:

@@ -126,6 +126,5 @@ def played(
         head, _, attribute = one.rpartition(".")
         there = f"{head}{MOTOR}.{attribute}" if head == f"joint:{name}" and attribute in MOVES else one
         settings[one] = setting_of(model, there)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     number = int(model.joint(name).id)
     return Played(model, make(model), settings, name, number, logs, f"joint:{name}{WIDTH}", seen)

@@ -74,6 +74,12 @@ def payload_place(model: Any, name: str) -> np.ndarray:
     return np.array(model.body_ipos[b])
 
 
+def follows_rates(model: Any, actuator: int) -> bool:
+    """Whether an actuator is a servo whose command is its joint's rate."""
+    gain, (_, stiff, damped) = model.actuator_gainprm[actuator, 0], model.actuator_biasprm[actuator, :3]
+    return bool(stiff == 0 and gain == -damped and gain > 0)
+
+
 def most_of(model: Any, actuator: int) -> float:
     """The largest force of an actuator; 0 where the model states none."""
     if model.actuator_forcelimited[actuator]:
@@ -201,8 +207,8 @@ def _geom(model: Any, name: str, attribute: str) -> Setting | None:
 
 def _actuator(model: Any, name: str, attribute: str) -> Setting | None:
     a, whole = object_id(model, "actuator", name), f"actuator:{name}.{attribute}"
-    if attribute == "gain":  # of a position servo its stiffness
-        entries = ("actuator_gainprm", (a, 0)), ("actuator_biasprm", (a, 1))
+    if attribute == "gain":  # of a servo of positions its stiffness, of one of rates its velocity gain
+        entries = ("actuator_gainprm", (a, 0)), ("actuator_biasprm", (a, 1 + follows_rates(model, a)))
         return Setting(whole, "1", 0.0, _larger(model, *entries))
     if attribute == "damping":
         nominal = -float(model.actuator_biasprm[a, 2])
