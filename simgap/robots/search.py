@@ -426,8 +426,8 @@ class Search:
         return self._densities[one, by]
 
     def _is_better(self, one: FittedSet, best: FittedSet) -> bool:
-        """Whether to go on from a set: it is likelier and has fewer causes, or as many with fewer parameters;
-        or it is much likelier and predicts held-out logs better.
+        """Whether to go on from a set: it is likelier and drops causes, or is as simple and predicts held-out
+        logs no worse; or it is much likelier and predicts them better.
 
         The judge is what the likelier set leaves: next to a discrepancy of twenty times the noise, a cause
         that explains it all hardly shows.
@@ -435,7 +435,7 @@ class Search:
         if {*one.names} < {*best.names} or one.score <= best.score:
             return one.score > best.score
         gains = self.gains(one, best, one)
-        if len(one.names) == len(best.names) and sum(one.sets.size) < sum(best.sets.size):
+        if len(one.names) == len(best.names) and sum(one.sets.size) <= sum(best.sets.size):
             return not predicts_better(-gains)
         return one.score > best.score + BETTER and predicts_better(gains)
 
