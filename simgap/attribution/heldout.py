@@ -187,9 +187,9 @@ class Heldout:
         shown = np.append(np.repeat((before - floor)[:-1].sum() > 0, len(self.folds)), True)
         if float(((before - floor) * shown).sum()) <= 0:
             return None
-        n, gone = float(floor[shown].sum()), fraction_gone(*((before - z) * shown for z in (after, floor)))
-        means = (float(each[shown].sum()) / n for each in (before, after))
-        return HowFar(*means, 1.0, *gone, self.gain(effects, ()))
+        n, score = float(floor[shown].sum()), self.gain(effects, ())
+        gone = fraction_gone((before - after) * shown, (before - floor) * shown)
+        return HowFar(float(before[shown].sum()) / n, float(after[shown].sum()) / n, 1.0, *gone, score)
 
     def gain(self, effects: Sequence[int], without: Sequence[int]) -> float:
         """Gain of the log predictive density of all trials [nats] by `effects` over the set `without`."""

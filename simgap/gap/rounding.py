@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from hmmseg.robust import runs
 
@@ -77,4 +77,4 @@ def _smoothed(read: np.ndarray, step: float) -> np.ndarray:
     low, high = STIFFNESS
     if excess(high) <= 0:
         return course(high)
-    return course(brentq(excess, low, high, xtol=0.05) if excess(low) < 0 else low)
+    return course(root_scalar(excess, bracket=STIFFNESS, xtol=0.05).root if excess(low) < 0 else low)
