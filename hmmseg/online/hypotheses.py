@@ -86,7 +86,7 @@ def _mix(one, other, a, b):
     """Mean and variance (2,) of a mixture."""
     gap = one[0] - other[0]
     one[1] = a * one[1] + b * other[1] + a * b * gap * gap
-    one[0] = a * one[0] + b * other[0]
+    one[0] -= b * gap  # equal means stay equal, however large
 
 
 @compiled
@@ -169,7 +169,7 @@ def _advance(table, count, fresh, t, dt, chain):
         if _enter(h, fresh.known[num_new], t, half, chain, state, 1 if off else state + 1):
             # another block, or another place: a departure
             h.state, h.missed, h.left_at = chain.num_steps, state, t
-        table.rows[i].weight += math.log1p(-away)
+        table.rows[i].weight -= dt / PACE  # of log1p(-away), finite after any gap
         num_new = _add(fresh, num_new, fresh, num_new)
     for j in range(num_new):
         count = _add(table, count, fresh, j)

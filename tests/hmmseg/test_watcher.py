@@ -256,6 +256,24 @@ def test_two_hypotheses_merge_to_the_moments_of_their_mixture():
         assert each[0, 1] == pytest.approx(drawn.var(), rel=0.01)
 
 
+def test_hypotheses_that_entered_at_the_same_time_still_do_once_merged_however_late_it_is():
+    """Rounded apart they would never merge again and fill their table: a clock that leaps ended in a hang."""
+    for share in np.linspace(0.05, 0.95, 19):
+        rows = np.zeros(2, HYPOTHESIS)
+        rows["weight"], rows["entered"][:, 0] = np.log([share, 1 - share]), 1.7e12 / 3
+        absorb(Table(rows, np.ones((2, 8, 2))), 0, Table(rows.copy(), np.ones((2, 8, 2))), 1)
+        assert rows["entered"][0, 0] == rows["entered"][1, 0]
+
+
+def test_a_clock_that_leaps_leaves_few_hypotheses():
+    watcher, t, table = read()
+    for at, row in zip([*t[:60], 3.9e7, 3.9e7 + 0.05, *t[60:80], 1e12], table[:83], strict=True):
+        watcher.update(float(at), row)
+        state = watcher.filter._state
+        mine = {(h["state"], h["entered"][0]) for h in state.rows[: state.count]}
+        assert len(mine) == state.count
+
+
 SETUP = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))  # untared
 
 
