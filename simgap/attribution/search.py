@@ -32,7 +32,8 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
     """Find the sets of effects within a window of the best.
 
     The neighbours of a set are screened from its mode in one step, the leading ones refined in a few, and
-    what leads then is fitted until it converges.
+    what leads then is fitted until it converges. Of a set whose effects were linearised at several points the
+    best counts.
 
     Args:
         f: Quadratic forms of the gap.
@@ -65,16 +66,20 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
             first = sorted(found, key=lambda m: -m.score)[:REFINED]
             seen |= {m.effects: fitted(f, m.effects) for m in first}
             rough |= {*new} - {*seen}
-    best = max(m.score for m in seen.values())
-    kept = [m for m in seen.values() if m.score > best - WINDOW or not m.effects]
-    return sorted(kept, key=lambda m: -m.score)
+    best, kept = max(m.score for m in seen.values()), dict[tuple, Model]()
+    for m in sorted(seen.values(), key=lambda m: -m.score):
+        if m.score > best - WINDOW or not m.effects:
+            kept.setdefault(tuple(sorted(f.gap.candidates[j].form_of for j in m.effects)), m)
+    return list(kept.values())
 
 
 def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
     """Sets with one effect added, removed or exchanged; only one form of an effect acts."""
     of = f.gap.candidates
     forms = [j for j, c in enumerate(of) if not c.beside]
-    mine = [next(j for j in forms if of[j].form_of == of[i].form_of) for i in effects]
+    mine = [
+        i if not of[i].beside else next(j for j in forms if of[j].form_of == of[i].form_of) for i in effects
+    ]
     fewer = [[j for j in mine if j != out] for out in mine]
     more = [
         [*e, j]
@@ -90,7 +95,7 @@ def _linearised(f: Forms, effects: Sequence[int]) -> tuple[int, ...]:
     of, out = f.gap.candidates, []
     for j in effects:
         rest = {of[i].name for i in effects} - {of[j].name}
-        same = [i for i, c in enumerate(of) if c.form_of == of[j].form_of]
+        same = [j, *(i for i, c in enumerate(of) if c.form_of == of[j].form_of)]
         out.append(min(same, key=lambda i: len({*of[i].beside} ^ rest)))
     return tuple(sorted(out))
 
