@@ -155,10 +155,9 @@ KilledWorker.__module__ = "distributed.scheduler"
 def test_ctrl_c_ends_all_workers_without_a_traceback(lab, moment):
     command = [sys.executable, "-m", "hmmseg_cli", "segment", "many", "--task", "task.toml", "--rig",
                "rig.toml", "--json", "stopped.json", "--workers", "2"]  # fmt: skip
-    running = subprocess.Popen(
-        command, stdout=-1, stderr=-1, text=True, start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # jobs in the background ignore it
-    )  # fmt: skip
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
+    running = subprocess.Popen(command, stdout=-1, stderr=-1, text=True, start_new_session=True)
+    signal.signal(signal.SIGINT, before)
     time.sleep(moment)
     if running.poll() is None:  # else a quick machine is done
         os.killpg(running.pid, signal.SIGINT)
