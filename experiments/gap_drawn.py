@@ -19,7 +19,7 @@ from experiments.blind_check.diagnose import diagnose_folder
 from experiments.blind_check.judge import intervals_hold
 from experiments.saving import save
 from experiments.table_text import markdown
-from simgap.attribution.verdict import ACTED, RECORD
+from simgap.attribution.verdict import RECORD
 
 RESULT = Path(__file__).parent / "results" / "gap_labs.json"
 SEEN = 0.01  # probability to act below which an effect is not listed
@@ -102,9 +102,10 @@ def _said(of: Sequence[tuple[float, bool]]) -> str:
 
 
 def record(rows: Sequence[dict[str, Any]]) -> float:
-    """Share of the named that is right over their mean probability before `RECORD` is taken off."""
+    """Share of named sets and of their causes that are right over their mean probability without `RECORD`."""
     of = [r for r in rows if r["verdict"] in ("named", "set") and r["confidence"] is not None]
-    return sum(map(is_right, of)) / max(sum(r["confidence"] for r in of) / RECORD, 1e-9)
+    each = [(is_right(r), r["confidence"]) for r in of] + [(act, p) for r in rows for p, act in r["acting"]]
+    return RECORD * sum(right for right, _ in each) / max(sum(p for _, p in each), 1e-9)
 
 
 def covered(label: dict[str, Any], found: dict[str, Any]) -> list[bool]:
@@ -195,8 +196,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         runs.setdefault(options.run, []).append(one)
         print(*(one[k] for k in ("case", "effects", "outcome", "causes", "held_out")), flush=True)
     print(f"record of what is named: {record(runs[options.run]):.2f}")
-    each = [one for r in runs[options.run] for one in r["acting"]]
-    print(f"of causes: {ACTED * sum(true for _, true in each) / max(sum(p for p, _ in each), 1e-9):.2f}")
     old = json.loads(options.output.read_text(encoding="utf-8")) if options.output.exists() else {"runs": {}}
     save(options.output, {"runs": old["runs"] | runs})
 

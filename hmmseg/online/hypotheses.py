@@ -136,13 +136,16 @@ def _enter(h, known, t, half, chain, before, after):
 
 @compiled
 def _add(table, count, fresh, j):
-    """Append a hypothesis, or merge it into one of its state that was entered at the same time."""
+    """Append a hypothesis, or merge it into one of its state that was entered at the same time.
+
+    The last row of a table stays free: it is the workspace of those who write hypotheses.
+    """
     state, entered = fresh.rows[j].state, fresh.rows[j].entered[0]
     for i in range(count):
         if table.rows[i].state == state and abs(table.rows[i].entered[0] - entered) < 1e-9:
             absorb(table, i, fresh, j)
             return count
-    if count < table.rows.shape[0]:
+    if count < table.rows.shape[0] - 1:
         _copy(table, count, fresh, j)
         return count + 1
     return count

@@ -381,10 +381,8 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
             gains = others.gains(causes, rest, rest)
             gained[j] = float(gains.sum() - gains[:-1].max())
             if rest and not of[j].parameters:
-                feigned, shown = (
-                    max(of[i].form for i in rest) * others.gain(rest, ()),
-                    gains.sum() - of[j].evidence,
-                )
+                feigned = max(of[i].form for i in rest) * others.gain(rest, ())
+                shown = gains.sum() - of[j].evidence
                 gained[j] -= max(shown, 0.0) if shown < feigned else 0.0
         least = min(gained, key=lambda j: gained[j])
         if gained[least] > POSITIVE:

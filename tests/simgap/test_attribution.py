@@ -22,7 +22,6 @@ from simgap.attribution.search import (
     weights,
 )
 from simgap.attribution.verdict import (
-    ACTED,
     ALARM,
     RECORD,
     Explanation,
@@ -213,7 +212,7 @@ def test_one_effect_is_named_with_its_size_and_share():
     assert found.verdict == "named" and found.causes == ("b",) and found.indistinguishable == ()
     value = found.effects["b"].parameters["b0"]
     assert (
-        value.mean == pytest.approx(3.0, abs=4 * value.sd) and found.effects["b"].probability > 0.93 * ACTED
+        value.mean == pytest.approx(3.0, abs=4 * value.sd) and found.effects["b"].probability > 0.93 * RECORD
     )
     assert found.effects["b"].share > 0.8 and found.remainder.share < 0.1 and found.remainder.p_value > 0.05
     assert found.how_far is not None and found.how_far.fraction > 0.8
@@ -495,6 +494,7 @@ def test_probabilities_told_are_as_often_right_as_they_say():
     named = conclude([one("a", 0.7), one("ab", 0.2), one("", 0.1)], SURE).probabilities
     assert sum(named.values()) == pytest.approx(1.0)
     assert named["a"] == pytest.approx(0.7 * RECORD) and named["unknown"] == pytest.approx(1 - 0.9 * RECORD)
+    assert acting([one("a", 0.7), one("ab", 0.2), one("", 0.1)], SURE)["a"] <= RECORD
     # Without an alarm: even odds beforehand, times a Bayes factor of 1/4 for a gap.
     quiet = Detection(-float(np.log(4.0)), 1.0, 0.0)
     assert quiet.unseen == pytest.approx(0.2) and Detection(3.0, 0.1, 0.0).unseen == 0.5
