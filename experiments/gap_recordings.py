@@ -1,6 +1,6 @@
 """The diagnosis on labelled recordings of a stand-in rig: verdict, parameters against the truth, time.
 
-    python -m experiments.gap_recordings RECORDINGS [--no-twins] [--json FILE]
+    python -m experiments.gap_recordings RECORDINGS [--json FILE]
 
 Four trials of every case, without `--actual` and with it, in one warm process. These recordings were in
 view while the diagnosis was built: they show that it works, the blind check shows how well. Writes
@@ -28,12 +28,12 @@ RESULT = Path(__file__).parent / "results" / "gap_recordings.json"
 TRIALS = 4
 
 
-def summary(case: Case, folder: Path, measured: bool, twins: bool = True) -> dict[str, Any]:
+def summary(case: Case, folder: Path, measured: bool) -> dict[str, Any]:
     """Summary of a diagnosis, with its processor and wall time [s]."""
     actual = read_actual(folder / "actual.toml", case.task.objects) if measured else None
     start, busy = time.perf_counter(), time.process_time()
     aligned = align(case.trials[:TRIALS], case.task, case.rig)
-    body = diagnose(aligned, actual, twins=twins).body
+    body = diagnose(aligned, actual).body
     wall, busy = time.perf_counter() - start, time.process_time() - busy
     best = body["effects"].get("+".join(body["causes"]), {"parameters": {}})
     return {
@@ -103,7 +103,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of this experiment."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("recordings", type=Path)
-    parser.add_argument("--no-twins", action="store_true")
     parser.add_argument("--json", type=Path, default=RESULT)
     options = parser.parse_args(arguments)
     folder = options.recordings
@@ -120,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "truth": label.get("params", {}),
         }  # fmt: skip
         for key, measured in (("blind", False), ("actual", True)):
-            row[key] = summary(case, path, measured, not options.no_twins)
+            row[key] = summary(case, path, measured)
             print(name, key, row[key]["verdict"], row[key]["causes"], row[key]["partners"],
                   row[key]["wall"], "s", flush=True)  # fmt: skip
         rows.append(row)

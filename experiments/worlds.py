@@ -22,7 +22,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Fingertip, Noise, Rig, Systematic, read_rig
 from hmmseg.io.task import BlockTask, parse_task, read_task
 from hmmseg.io.trial import Trial
-from simgap.gap.twins import recorded
+from simgap.gap.simulated import recorded
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.operator import OperatorSettings, Plan, Window, minimum_jerk
 from simgap.world.properties import Block

@@ -1,18 +1,16 @@
 """Files kept between runs in the user's cache folder, without which everything is recomputed.
 
 A file holds a digest, then its content; anything else (truncated, garbled, foreign) is ignored, reported
-once and replaced. Numbers are kept as JSON, never as code.
+once and replaced.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import tempfile
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 
 MAGIC = b"hmmseg cache 1\n"
@@ -80,21 +78,3 @@ def _damaged(path: Path) -> None:
     if path.parent not in _said:
         _said.add(path.parent)
         warnings.warn(f"{path}: not as it was written; recomputed", CacheWarning, stacklevel=4)
-
-
-def keep_numbers(path: Path | None, numbers: Sequence[float]) -> None:
-    """Keep numbers under a path of the cache."""
-    keep(path, json.dumps(list(numbers)).encode())
-
-
-def kept_numbers(path: Path | None) -> list[float]:
-    """The numbers kept under a path; empty if there are none, or the file is damaged."""
-    content = kept(path)
-    if content is None or path is None:
-        return []
-    with contextlib.suppress(ValueError, RecursionError):
-        found = json.loads(content)
-        if isinstance(found, list) and all(isinstance(each, float | int) for each in found):
-            return [float(each) for each in found]
-    _damaged(path)  # its digest is right, but this code did not write it
-    return []

@@ -136,8 +136,8 @@ OpenPage = Annotated[bool, option("--open/--no-open", None, "Open the page in th
 ActualBlocks = Annotated[File, option("--actual", "A",
     "Properties measured independently of the trials (TOML).", of=BLOCKS)]
 Healthy = Annotated[Paths, option("--healthy", "TRIAL...",
-    "Recordings known to be healthy, the best null; by default healthy twins are simulated. With a "
-    "model of a robot: its earlier logs, to find what changed.")]
+    "Recordings known to be healthy, the best null; by default the stated noise. With a model of a robot: "
+    "its earlier logs, to find what changed.")]
 Against = Annotated[Paths, option("--against", "SIM...",
     "Simulated trials to compare with; a plain ordered task needs them.", of=GIVEN)]
 ModelOrEmissions = Annotated[File, option("--model", "M",

@@ -273,9 +273,8 @@ def _detection(body: Body) -> str:
         text = f"Logs of a robot that is as its model differ from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."
-    twins = round(1 / fineness) - 1
-    few = "one healthy twin was" if twins == 1 else f"{twins} healthy twins were"
-    return f"{text}. This follows from the sensors' noise: {few} simulated, too few to count."
+    others = round(1 / fineness) - 1
+    return f"{text}. Ranks among {others} healthy ones alone could show {fineness:.2g} at least."
 
 
 def _far(body: Body) -> str:

@@ -75,7 +75,7 @@ def diagnose(
         rig: The nominal hand: a path, a dict, or the result of `Rig.read`.
         actual: Properties measured independently of the trials: a path or a dict.
         effects: Causes to impose instead of choosing them.
-        healthy: Recordings of the same task and hand that replace simulated healthy twins as the null.
+        healthy: Recordings of the same task and hand as the null, in place of the stated noise.
         seed: Seed of all random draws.
         progress: Called with a description of each stage.
 

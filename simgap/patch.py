@@ -20,8 +20,8 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from simgap.effects import catalogue, effect_named
 from simgap.effects.base import KINEMATICS, Performance, interval_comment, number, table
-from simgap.gap.twins import altered, carried, recorded, scene_of
-from simgap.gap.twins import performed as perform
+from simgap.gap.simulated import altered, carried, recorded, scene_of
+from simgap.gap.simulated import performed as perform
 from simgap.world.dynamics import interpolated
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks

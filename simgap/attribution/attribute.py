@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
 
@@ -189,7 +189,7 @@ EXAMINED = 6  # numerics: sets that are examined as causes
 
 def attribute(
     gap: Gap,
-    twins: Iterable[float] | Callable[[float], Iterable[float]] | None = None,
+    healthy: Iterable[float] = (),
     forced: tuple[str, ...] = (),
     seed: int = 0,
     heldout: bool = True,
@@ -200,8 +200,8 @@ def attribute(
 
     Args:
         gap: The gap.
-        twins: Statistics of healthy twins, drawn one by one, or a function of the gap's own statistic that
-            gives them. Without twins the stated noise is the null.
+        healthy: Statistics of healthy recordings, drawn one by one if there is an alarm; without any the
+            stated noise is the null.
         forced: Effects that act for certain; no others do.
         seed: Of the draws behind intervals.
         heldout: Whether causes must shrink the gap of held-out trials, if there are several trials.
@@ -236,8 +236,8 @@ def attribute(
         certain = gap.usual and chance["none"] + chance["unknown"] <= DOUBT  # can be mended
         return None if certain else small
 
-    if ignored() is None:  # else twins could only make it likelier that there is none
-        detection = detected(value, twins(value) if callable(twins) else twins)
+    if detection.p_value < ALARM and ignored() is None:
+        detection = detected(value, healthy)
         small = ignored() if detection.p_value < ALARM or forced else None
     first = next(iter(examined), ())
     named = _names(f, first) if forced else ()

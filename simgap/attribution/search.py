@@ -24,11 +24,11 @@ from simgap.attribution.posterior import (
 # numerics: neighbours of a set refined after screening, steps of this refinement, and neighbours then fitted
 SHORT, SCREEN, REFINED = 16, 3, 5
 WINDOW = 12.0  # numerics: nats below the best set within which a set is kept
-BEAM = 5  # numerics: sets of each size that are extended
+BEAM = 5  # numerics: sets that are extended
 MOST = 6  # numerics: most effects in a set
 
 
-def sought(f: Forms, beam: int = BEAM) -> list[Model]:
+def sought(f: Forms) -> list[Model]:
     """Find the sets of effects within a window of the best.
 
     The neighbours of a set are screened from its mode in one step, the leading ones refined in a few, and
@@ -37,7 +37,6 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
 
     Args:
         f: Quadratic forms of the gap.
-        beam: Number of sets in the window that are extended.
 
     Returns:
         The sets, best first; the empty set is always one of them.
@@ -53,8 +52,8 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
     while True:
         best = max(m.score for m in seen.values())
         ranked = sorted(seen.values(), key=lambda m: -m.score)
-        leading = [alone, *[m for m in ranked if m.score > best - WINDOW][:beam]]
-        leading += [m for m in ranked if len(m.effects) == 1][: 2 if beam > 1 else 0]
+        leading = [alone, *[m for m in ranked if m.score > best - WINDOW][:BEAM]]
+        leading += [m for m in ranked if len(m.effects) == 1][:2]
         todo = [m for m in leading if m.effects not in opened and len(m.effects) < MOST]
         if not todo:
             break
@@ -109,13 +108,13 @@ def weights(models: list[Model]) -> np.ndarray:
 # Whether there is a gap at all: a Bayes factor, whose inverse bounds the p-value.
 #
 # Under the healthy model a Bayes factor against it exceeds b with a probability of at most 1 / b (an e-value:
-# Vovk & Wang, Ann. Stat. 49, 2021). No simulator is exactly the healthy model: the statistics of healthy
-# twins tell by how much the bound is off (conformal rank: Besag & Clifford, Biometrika 78, 1991).
+# Vovk & Wang, Ann. Stat. 49, 2021). No model is exactly right: where there are healthy recordings, their
+# statistics tell by how much the bound is off (conformal rank: Besag & Clifford, Biometrika 78, 1991).
 
 # prior: further shares of groups in which the model is off: a gap may be confined to one place
 RARE = (0.002, 0.01, 0.03)
-ENOUGH = 4  # cited: twins as extreme after which a p-value is clear (Besag & Clifford's h)
-SURE = 1e-6  # chosen: p-value that is clear even if the next twin were twice as extreme as those before
+ENOUGH = 4  # cited: healthy ones as extreme after which a p-value is clear (Besag & Clifford's h)
+SURE = 1e-6  # chosen: p-value that is clear even if the next one were twice as extreme as those before
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,7 @@ class Detection:
     Attributes:
         statistic: Log Bayes factor of a gap [nats].
         p_value: Probability that a healthy recording shows so large a statistic.
-        resolution: Smallest p-value that the twins could have given; 0 without twins.
+        resolution: Smallest p-value that ranks among healthy recordings could have given; 0 without any.
     """
 
     statistic: float
@@ -170,34 +169,27 @@ def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
 
 def clear(value: float, most: float) -> bool:
     """Whether a statistic is surely a gap, even if a healthy one reached twice the largest seen (`most`)."""
-    return max(0.0, most) < doubtful(value)
+    return max(0.0, most) < (value + float(np.log(SURE))) / 2
 
 
-def doubtful(value: float) -> float:
-    """Smallest statistic [nats] of a healthy recording that leaves a gap's `value` in doubt."""
-    return (value + float(np.log(SURE))) / 2
-
-
-def detected(value: float, twins: Iterable[float] | None = None) -> Detection:
-    """Test for a gap, by theory or against healthy twins.
+def detected(value: float, healthy: Iterable[float] = ()) -> Detection:
+    """Test for a gap, by theory or against healthy recordings.
 
     By Markov's inequality a healthy recording exceeds s with a probability of at most exp(-s) times the
-    expectation of its Bayes factor: one in theory, estimated from twins. The rank among the twins gives a
+    expectation of its Bayes factor: one in theory, estimated from healthy ones. The rank among these gives a
     second p-value; the larger of the two counts.
 
     Args:
         value: The statistic of the recording [nats].
-        twins: Statistics of healthy twins. They are drawn one by one until the answer is clear: ENOUGH exceed
-            the recording's, or a next one twice as extreme would leave no doubt.
+        healthy: Statistics of healthy recordings. They are drawn one by one until the answer is clear: ENOUGH
+            exceed the recording's, or a next one twice as extreme would leave no doubt.
     """
     p = float(np.exp(min(0.0, -value)))
-    if twins is None:
-        return Detection(value, p, 0.0)
     taken: list[float] = []
     exceed = 0
-    for twin in twins:
-        taken.append(float(twin))
-        exceed += twin >= value
+    for other in healthy:
+        taken.append(float(other))
+        exceed += other >= value
         expected = float(np.logaddexp.reduce([*taken, 0.0])) - np.log(len(taken) + 1)
         p = float(np.exp(min(0.0, max(expected, 0.0) - value)))
         if exceed >= ENOUGH or clear(value, max(taken)):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,6 @@ from simgap.gap.problem import (
 )
 from simgap.gap.residuals import net_forces
 from simgap.gap.search import PROMISING, Identified, Search, best_fit, search
-from simgap.gap.twins import own_healthy, twin_statistics
 from simgap.progress import Progress, silent
 from simgap.report.finding import sentence, tables
 
@@ -225,7 +224,7 @@ def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
 
 
 STAGES = 12  # look: most stages that `progress` reports
-NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm, with twins or without
+NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
 
 
 @dataclass(frozen=True, repr=False)
@@ -308,7 +307,6 @@ def diagnose(
     forced: Sequence[str] = (),
     seed: int = 0,
     progress: Progress | None = None,
-    twins: bool = True,
     healthy: AlignedTrials | None = None,
     excluded: Sequence[str] = (),
     identified: Identified | None = None,
@@ -319,10 +317,9 @@ def diagnose(
         aligned: The recordings.
         actual: Measured properties as `estimation.report.read_actual` returns them.
         forced: Effects that are imposed instead of chosen.
-        seed: Of twins and draws.
+        seed: Of all draws.
         progress: Called with a description of each stage.
-        twins: Whether simulated healthy twins are the null; without them the stated noise is.
-        healthy: Healthy recordings of the same task and rig, which replace the twins.
+        healthy: Healthy recordings of the same task and rig as the null, in place of the stated noise.
         excluded: Effects that are not considered.
         identified: Properties identified from the same trials, if known.
 
@@ -339,11 +336,7 @@ def diagnose(
     found = search(aligned, actual, excluded, forced, tell, identified)
     tell("attributing the gap")
 
-    def null(value: float) -> Iterable[float]:
-        if healthy is not None:
-            return own_healthy(found, healthy, actual)
-        return twin_statistics(found, value, actual, seed, tell) if twins and value > NIL else ()
-
+    null = () if healthy is None else healthy_statistics(found, healthy, actual)
     gap, verdict = attributed(found, forced, seed, null)
     causes = _causes(found, gap, verdict)
     following = None
@@ -361,6 +354,15 @@ def diagnose(
     return Diagnosis(document, found, causes, verdict, before, after, warnings, seed)
 
 
+def healthy_statistics(found: Search, healthy: AlignedTrials, actual: dict | None) -> Iterator[float]:
+    """Statistics [nats] of healthy recordings, in groups as large as the diagnosed one."""
+    every = healthy.trials
+    size = min(found.problem.frame.num_trials, len(every))
+    for start in range(0, len(every) - size + 1, size):
+        f = forms(search(replace(healthy, trials=every[start : start + size]), actual).gap)
+        yield statistic(f, sought(f))
+
+
 def _inseparable(verdict: Attribution, following: dict[str, Any] | None) -> list[str]:
     """A warning that names effects that no listed experiment is expected to separate from the causes."""
     left = sorted(set(verdict.indistinguishable) - set([] if following is None else following["separates"]))
@@ -375,7 +377,7 @@ def attributed(
     found: Search,
     forced: tuple[str, ...] = (),
     seed: int = 0,
-    twins: Callable[[float], Iterable[float]] | None = None,
+    healthy: Iterable[float] = (),
 ) -> tuple[Gap, Attribution]:
     """Attribute the gap of a search, with effects that act together linearised where they do.
 
@@ -383,7 +385,7 @@ def attributed(
         found: The search.
         forced: Effects that are imposed instead of chosen.
         seed: Of the draws behind intervals.
-        twins: Gives statistics of healthy twins for that of the gap.
+        healthy: Statistics of healthy recordings, drawn if there is an alarm.
     """
     f, gap = forms(found.gap), found.gap
     models: list[Model] | None = sought(f)
@@ -398,7 +400,7 @@ def attributed(
             )  # fmt: skip
             gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
-    return gap, attribute(gap, twins, forced, seed, models=models, absorbed=absorbed)
+    return gap, attribute(gap, healthy, forced, seed, models=models, absorbed=absorbed)
 
 
 def _after_first(found: Search, f: Forms, models: list[Model]) -> tuple[Gap, list[Model]]:

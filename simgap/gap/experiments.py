@@ -19,7 +19,7 @@ from simgap.effects import catalogue, forms_of, name_of
 from simgap.gap.frame import build
 from simgap.gap.problem import fit, neutral, problem
 from simgap.gap.search import Search, best_fit
-from simgap.gap.twins import Values, blocks_of, measured_on, performed, recorded
+from simgap.gap.simulated import Values, blocks_of, measured_on, performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Blocks
 from simgap.world.simulate import task_table

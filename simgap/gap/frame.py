@@ -95,19 +95,6 @@ def check_forced(forced: Sequence[str]) -> None:
             raise InputError(f"effect {name!r}", problem, ", ".join(known))
 
 
-def as_from_wrist(trial: Trial, like: Trial) -> Trial:
-    """A simulated trial of two fingers as a wrist sensor would record it, with derived channels marked."""
-    c = dict(trial.channels)
-    for axis in "xy":
-        half = (c[f"f{axis}1"] + c[f"f{axis}2"]) / 2
-        grip = (c["fx1"] - c["fx2"]) / 2 if axis == "x" else 0.0
-        c[f"f{axis}1"], c[f"f{axis}2"] = half + grip, half - grip
-    middle = (c["y1"] + c["y2"]) / 2
-    c["y1"], c["y2"] = middle, middle
-    assert like.inertia is not None
-    return replace(trial, channels=c, inertia=np.zeros((trial.t.size, 2)), hidden=like.hidden)
-
-
 # One aligned trial as arrays over its samples: signals, states, noise, and where each equation holds.
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")

@@ -76,7 +76,7 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[np.ndarray]:
     return out
 
 
-def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMISING) -> Fitted:
+def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     """Fit one form of an effect after those of `healthy`, which are refitted with the properties.
 
     Starts are ranked by the cost after a linear step in their amplitudes: a frequency cannot be found while
@@ -88,7 +88,6 @@ def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMI
         given: The problem.
         key: The form.
         healthy: The fit to start from.
-        promising: Gain of a linear step [nats] below which the start is not refined.
     """
     base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_common]
     base[: given.measured.size][given.measured.ravel()] = 0.0
@@ -96,7 +95,7 @@ def best_fit(given: Problem, key: str, healthy: Fitted, promising: float = PROMI
     effects = (*healthy.effects, key)
     every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
     ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
-    if healthy.cost - ranked[0][0] < promising:
+    if healthy.cost - ranked[0][0] < PROMISING:
         return fit(given, effects, ranked[0][2], 0, usual)
     leading = [u for _, u, _ in ranked[:LEADERS]]
     if len(leading) > 1:
@@ -227,8 +226,6 @@ def search(
     forced: Sequence[str] = (),
     tell: Progress = silent,
     identified: Identified | None = None,
-    noisy: bool = True,
-    promising: float = PROMISING,
 ) -> Search:
     """Fit the catalogue, and effects that are `forced`, to aligned trials.
 
@@ -239,9 +236,6 @@ def search(
         forced: Effects considered in any case.
         tell: Called with a description of each stage.
         identified: Properties identified from the same trials, if known.
-        noisy: Whether to estimate the effect of sensor noise on the candidates
-            (`simgap.gap.assemble.redrawn`), which takes half of the time.
-        promising: See `best_fit`.
 
     Raises:
         InputError: No trial fits its task.
@@ -266,9 +260,9 @@ def search(
     # What moves contacts also moves the moments that turn a block, by as much as these pads let it.
     given = with_nuisances(given, healthy.u)
     healthy = fit(given, (), healthy.u)
-    fits = [best_fit(given, key, healthy, promising) for key in keys]
-    others = redrawn(given) if noisy else ()
-    for _ in range(ROUNDS if noisy else 0):
+    fits = [best_fit(given, key, healthy) for key in keys]
+    others = redrawn(given)
+    for _ in range(ROUNDS):
         again = _anew(every, aligned, given, healthy, fits, others)
         if again is None:
             break

@@ -30,7 +30,7 @@ from simgap.attribution.attribute import Attribution, ParameterPosterior, attrib
 from simgap.attribution.posterior import forms
 from simgap.attribution.problem import Candidate, Gap, Rows
 from simgap.attribution.search import sought, statistic
-from simgap.attribution.verdict import ALARM, entries, log_odds, rows
+from simgap.attribution.verdict import entries, log_odds, rows
 from simgap.channels import delayed
 from simgap.generic.effects import Scene, Slot, effects, predicted, scene, slots
 from simgap.generic.ring import find_ring
@@ -42,7 +42,6 @@ LATE = 0.02  # numerics: s; a small delay
 PACE = 0.02  # chosen: smallest relative sd of a duration: clocks repeat exactly, and less does not matter
 SMALLEST = 1e-6  # numerics: smallest sd, as a share of a channel's scale
 EXCHANGES = 20  # numerics: most exchanges of labels
-QUIET = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
 STEP = 1e-3  # numerics: step of finite differences, in prior standard deviations
 STEPS = 20  # numerics: most function evaluations of a fit
 CLOSE = 1e-4  # numerics: relative tolerance of a fit's cost
@@ -104,10 +103,8 @@ def diagnose(
             gap, models = replace(gap, candidates=(*gap.candidates, *together)), None
     tell("attributing the gap")
 
-    def twins(value: float) -> Iterable[float]:
-        return _exchanged(given, real, sim, seed) if value > QUIET else ()
-
-    verdict = attribute(gap, twins, tuple(dict.fromkeys(forced)), seed, models=models)
+    exchanged = _exchanged(given, real, sim, seed)
+    verdict = attribute(gap, exchanged, tuple(dict.fromkeys(forced)), seed, models=models)
     return _document(given, gap, white, verdict, real, sim)
 
 
@@ -130,7 +127,7 @@ def _exchanged(given: Scene, real: np.ndarray, sim: np.ndarray, seed: int) -> It
     for labelled in chosen[:EXCHANGES]:
         as_real = np.isin(np.arange(len(every)), labelled)
         f = forms(fitted_gap(given, every[as_real], every[~as_real])[1])
-        yield statistic(f, sought(f, 1))
+        yield statistic(f, sought(f))
 
 
 @dataclass(frozen=True)

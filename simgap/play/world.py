@@ -14,7 +14,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from simgap.effects import catalogue
 from simgap.effects.base import HandEffect, Performance
-from simgap.gap.twins import Values, altered, scene_of
+from simgap.gap.simulated import Values, altered, scene_of
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.properties import Blocks
 from simgap.world.virtual_model import Surroundings, VirtualModel, finite_stiffness

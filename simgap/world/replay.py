@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.ndimage import gaussian_filter1d
 from scipy.special import gammaincinv
 
 from hmmseg.hand.signals import Signals, task_space
@@ -19,8 +18,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import segment
 from simgap.world.dynamics import BUCKET, CONTROL_PERIOD, Record, interpolated
-from simgap.world.operator import Plan, Window
-from simgap.world.properties import Blocks, standing_heights
+from simgap.world.properties import Blocks
 from simgap.world.virtual_model import Surroundings, physics, rollout, standing, substeps_for
 
 # Smooth finger motions from noisy samples of position and velocity.
@@ -246,63 +244,3 @@ def residual_summary(
         if chosen.any():
             out[state] = float(np.sqrt(np.nanmean(net[chosen] ** 2)))
     return out
-
-
-# A recorded performance repeated: commands under which a simulated hand moves and presses as recorded.
-#
-# They give what a healthy recording of this very operator would show, with its profile of speed, pace, grip
-# and order of fingers, without a model of a person. The tips follow the smoothed recorded motion; in contact
-# the command lies beyond it by what the recorded force requires (impedance control, as in
-# `simgap.world.dynamics`).
-
-# chosen: kg, N/m, damping ratio. Stiff enough for the tips to keep to the recorded motion, and soft enough
-# for position noise to make little force through pads of any stiffness.
-MASS, STIFFNESS, DAMPING = 0.1, 2000.0, 1.0
-# numerics: sd of the commands' smoothing in sample intervals: faster fluctuations are noise
-BETWEEN = 0.5
-QUICKEST = 0.01  # prior: s; the least such sd, as no hand commands faster
-HEARD = 3.0  # chosen: sds of noise above which a force is real
-
-
-def plan_again(
-    signals: Signals, task: BlockTask, blocks: Blocks, boundaries: Sequence[float], force_sd: float
-) -> Plan:
-    """Plan a performance as recorded, with its `boundaries` [s] between the subtasks.
-
-    `force_sd` [N] is the noise of one force sample. ValueError if the noise of positions is unknown.
-    """
-    path = finger_motion(signals)
-    if not np.isfinite(path.position).all():
-        raise ValueError("motion that cannot be smoothed")
-    start, duration = float(signals.t[0]), float(signals.t[-1] - signals.t[0])
-    t = np.arange(round(duration / CONTROL_PERIOD) + 1) * CONTROL_PERIOD
-    position = path.at(start + t)[0] @ TO_TIPS.T
-    command = position + _load(signals, force_sd, start + t) / STIFFNESS
-    blur = max(BETWEEN * float(np.median(np.diff(signals.t))), QUICKEST)
-    command = gaussian_filter1d(command, blur / CONTROL_PERIOD, axis=0, mode="nearest")
-    heights = standing_heights(task.initial, {name: blocks[name].height for name in task.objects})
-    x = places(signals, path, task, np.asarray(boundaries))
-    windows = _windows_of(task, np.asarray(boundaries) - start)
-    damping = 2 * DAMPING * np.sqrt(MASS * STIFFNESS)
-    where = {name: (x[name], heights[name]) for name in task.objects}
-    return Plan(command, (MASS, STIFFNESS, damping), where, windows, duration)
-
-
-def _load(signals: Signals, sd: float, t: np.ndarray) -> np.ndarray:
-    """Smoothed forces (len(t), 4) [N] of the tips x1, y1, x2, y2; zero where they are within the noise."""
-    force = _forces(signals)
-    unknown, noise = np.full_like(force, np.nan), np.full_like(force, sd)
-    smoothed = smooth(signals.t, force, unknown, noise, noise)
-    load = np.where(np.abs(smoothed.position) > HEARD * smoothed.sd, smoothed.position, 0.0)
-    return interpolated(t, signals.t, load)
-
-
-def _windows_of(task: BlockTask, boundaries: np.ndarray) -> tuple[Window, ...]:
-    """Command times of the moves, from the four boundaries [s] of each."""
-    out, before = [], 0.0
-    for k, move in enumerate(task.performed):
-        touch, leave, meet, part = boundaries[4 * k : 4 * k + 4]
-        out.append(Window(move.object, move.slide, before, (touch + leave) / 2, (leave + meet) / 2,
-                          (meet + part) / 2, part + (part - meet) / 2))  # fmt: skip
-        before = part
-    return tuple(out)

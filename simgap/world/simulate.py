@@ -153,14 +153,6 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
              for blocks, seed in zip(properties, seeds, strict=True)]  # fmt: skip
     if alter is not None:
         plans = [alter(p, np.random.default_rng([seed, 4])) for p, seed in zip(plans, seeds, strict=True)]
-    return simulate_plans(task, rig, plans, properties, seeds, surroundings)
-
-
-@double_precision
-def simulate_plans(task: BlockTask, rig: Rig, plans: Sequence[Plan], properties: Sequence[Blocks],
-                   seeds: Sequence[int], surroundings: Surroundings | None = None,
-                   ) -> list[SimulatedTrial]:  # fmt: skip
-    """Perform given plans, each with its blocks; sensor noise is drawn from the seeds."""
     scenes = [physics(rig, [blocks[name] for name in task.objects], surroundings) for blocks in properties]
     substeps = max(substeps_for(scene, CONTROL_PERIOD) for scene in scenes)
     length = -(-max(len(p.command) for p in plans) // BUCKET) * BUCKET

@@ -9,7 +9,7 @@ import warnings
 import pytest
 
 from hmmseg import cache
-from hmmseg.cache import CacheWarning, cache_folder, keep_numbers, kept_numbers
+from hmmseg.cache import CacheWarning, cache_folder, keep, kept
 
 
 @pytest.fixture(autouse=True)
@@ -17,10 +17,9 @@ def unsaid(monkeypatch):
     monkeypatch.setattr(cache, "_said", set())
 
 
-def test_numbers_come_back_as_they_were(tmp_path):
-    numbers = [0.1, -1e300, float("inf"), 3.0]
-    keep_numbers(tmp_path / "new/one.json", numbers)
-    assert kept_numbers(tmp_path / "new/one.json") == numbers
+def test_bytes_come_back_as_they_were(tmp_path):
+    keep(tmp_path / "new/one.json", b"\x00\xff")
+    assert kept(tmp_path / "new/one.json") == b"\x00\xff"
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["one.json"]
 
 
@@ -28,7 +27,7 @@ def test_numbers_come_back_as_they_were(tmp_path):
 def test_a_damaged_file_is_said_once_and_made_anew(damage, tmp_path):
     path, other = tmp_path / "one.json", tmp_path / "other.json"
     for each in (path, other):
-        keep_numbers(each, [1, 2])
+        keep(each, b"[1, 2]")
         content = bytearray(each.read_bytes())
         middle = len(content) // 2
         content[middle] ^= 0x10
@@ -42,17 +41,10 @@ def test_a_damaged_file_is_said_once_and_made_anew(damage, tmp_path):
         }[damage])  # fmt: skip
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        assert kept_numbers(path) == kept_numbers(other) == []
+        assert kept(path) is kept(other) is None
     assert [w.category for w in said] == ([] if damage == "folder" else [CacheWarning])
-    keep_numbers(path, [3])
-    assert kept_numbers(path) == ([] if damage == "folder" else [3])
-
-
-@pytest.mark.parametrize("content", [b"{}", b'["1"]', b"[" * 10**5, b"\xff"])
-def test_a_whole_file_of_something_else_counts_as_nothing(content, tmp_path):
-    cache.keep(tmp_path / "one.json", content)
-    with pytest.warns(CacheWarning):
-        assert kept_numbers(tmp_path / "one.json") == []
+    keep(path, b"3")
+    assert kept(path) == (None if damage == "folder" else b"3")
 
 
 @pytest.mark.parametrize("where", ["/proc/nowhere", "a file", "relative", ""])
@@ -63,8 +55,8 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(where, tmp_path, monke
     monkeypatch.setenv("HOME", "/proc/nowhere")
     folder = cache_folder()
     assert folder is not None
-    keep_numbers(folder / "one.json", [1])
-    assert kept_numbers(folder / "one.json") == []
+    keep(folder / "one.json", b"1")
+    assert kept(folder / "one.json") is None
     assert os.listdir(tmp_path) == ["a file"]
 
 

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from estimation import identify
 from estimation.identification import identify_aligned
@@ -167,9 +168,7 @@ def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line
     for name, factor in change.items():
         columns[name] = columns[name] * factor
     rig = wrist_rig(setup, **said)
-    with pytest.raises(InputError, match=line) as told:
-        read_trial(columns, rig)
-    assert "\n" not in str(told.value)
+    refused(line, read_trial, columns, rig)
 
 
 def test_a_place_that_never_changes_is_an_axis_without_motion(performed):

@@ -14,7 +14,7 @@ from simgap.gap.frame import CHANNELS, _struck, build
 from simgap.gap.problem import fit, neutral, problem, residual_at, residual_of
 from simgap.gap.residuals import fivepoint
 from simgap.gap.sensor_noise import changes, kinks, of_a_kink, speed_jumps
-from simgap.gap.twins import performed, recorded
+from simgap.gap.simulated import performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 from tests.simgap.test_gap_effects import performance, world_of

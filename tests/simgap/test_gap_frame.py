@@ -1,6 +1,5 @@
-"""Twins: kept for the code that made them, and a recorded performance simulated once more."""
+"""What a frame leaves out or doubts, and the blocks of simulated recordings."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,43 +7,24 @@ import pytest
 from demo_recordings import RIG, TASK, TRIALS
 
 from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import Noise
 from hmmseg.segmentation.align import align
-from simgap.gap import twins
+from simgap.gap import simulated
 from simgap.gap.frame import CHANNELS, build, thinned, without_dropouts
 from simgap.gap.search import search
 from simgap.gap.sensor_noise import sensor_sd
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
-from simgap.world.replay import plan_again
-from simgap.world.simulate import SimulatedTrial, noise_sd, simulate_plans, simulate_trials
+from simgap.world.simulate import SimulatedTrial, simulate_trials
 
 
-def test_other_code_has_a_cache_of_its_own(monkeypatch):
-    known = twins.source_digest()
-    mine = twins._file(TRIALS, TASK, RIG, None, 0)
-    assert re.fullmatch("[0-9a-f]{64}", known)
-    assert mine == twins._file(TRIALS, TASK, RIG, None, 0) != twins._file(TRIALS, TASK, RIG, None, 1)
-    monkeypatch.setattr(twins, "source_digest", lambda: known[::-1])
-    assert twins._file(TRIALS, TASK, RIG, None, 0) != mine
-
-
-def test_without_stated_noise_there_are_twins_too():
-    rig = RIG.model_copy(update={"noise": Noise()})
-    found = search(align(TRIALS[:1], TASK, rig))
-    twin = twins._recorded(found, twins.blocks_of(found), range(1), 0)
-    assert len(twin) == 1 and len(twin[0]) == 1
-    assert np.isfinite(twin[0][0].channels["fx1"]).all()
-
-
-def test_twins_have_the_blocks_that_were_recorded_whatever_was_measured():
-    alone = twins.blocks_of(search(align(TRIALS, TASK, RIG), noisy=False))
+def test_blocks_are_those_that_were_recorded_whatever_was_measured():
+    alone = simulated.blocks_of(search(align(TRIALS, TASK, RIG)))
     wrong = {"block1": {"height": (alone["block1"].height + 2e-3, 1e-4)}}
-    told = twins.blocks_of(search(align(TRIALS, TASK, RIG), wrong, noisy=False))
+    told = simulated.blocks_of(search(align(TRIALS, TASK, RIG), wrong))
     assert told["block1"].height == pytest.approx(alone["block1"].height, abs=2e-4)
     assert told["block2"].width == pytest.approx(alone["block2"].width, abs=1e-4)
-    assert twins.measured_on(told, wrong) == {"block1": {"height": (told["block1"].height, 1e-4)}}
-    assert twins.measured_on(told, None) is None
+    assert simulated.measured_on(told, wrong) == {"block1": {"height": (told["block1"].height, 1e-4)}}
+    assert simulated.measured_on(told, None) is None
 
 
 BLOCKS = {name: Block(0.5, 0.02 + 0.004 * k, 0.018, 0.7) for k, name in enumerate(TASK.objects)}
@@ -56,18 +36,6 @@ def quick() -> SimulatedTrial:
     """A hasty operator at 500 Hz."""
     rig = RIG.model_copy(update={"rate": 500.0})
     return simulate_trials(TASK, rig, [BLOCKS], [41], OperatorSettings(pace=(1.8, 1.8)))[0]
-
-
-def test_a_repetition_moves_and_presses_as_was_recorded(quick):
-    rig = RIG.model_copy(update={"rate": 500.0})
-    signals, noise = task_space(quick.trial, rig), noise_sd(rig, "force")
-    plan = plan_again(signals, TASK, BLOCKS, list(quick.boundaries), noise)
-    again = simulate_plans(TASK, rig, [plan], [BLOCKS], [42])[0]
-    np.testing.assert_allclose(again.boundaries, quick.boundaries, atol=0.025)
-    n = min(quick.trial.t.size, again.trial.t.size)
-    for c in FORCES:
-        apart = again.trial.channels[c][:n] - quick.trial.channels[c][:n]
-        assert np.sqrt(np.mean(apart**2)) < 0.15 * np.std(quick.trial.channels["fx1"])
 
 
 def test_a_reading_that_one_finger_lost_is_left_out(quick):
