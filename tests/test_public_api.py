@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from refusals import refused
 
 import estimation
 import hmmseg
@@ -105,18 +104,23 @@ def test_readers_take_paths_tables_and_arrays():
 
 
 def test_mistakes_say_what_to_write():
-    refused("rig: missing", segment, STACK / "trial_01.csv", STACK / "task.toml")
-    refused("no blocks", align, STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
+    with pytest.raises(InputError, match="rig: missing"):
+        segment(STACK / "trial_01.csv", STACK / "task.toml")
+    with pytest.raises(InputError, match="no blocks"):
+        align(STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
     bare = hmmseg.Trial("bare", np.arange(9.0), {"x1": np.zeros(9)})
-    refused("bare: has no channel fx1", segment, bare, STACK / "task.toml", STACK / "rig.toml")
+    with pytest.raises(InputError, match="bare: has no channel fx1"):
+        segment(bare, STACK / "task.toml", STACK / "rig.toml")
     with pytest.raises(InputError, match=r"block1\.width: missing; expected a number in m"):
         simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": {"weight": 0.3}, "block2": {}})
-    refused("needs no fit", hmmseg.fit, STACK / "trial_01.csv", STACK / "task.toml")
+    with pytest.raises(InputError, match="needs no fit"):
+        hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
     for none in (
         lambda: segment([], STACK / "task.toml", STACK / "rig.toml"),
         lambda: segment([], {"sequence": ["a", "b"]}),
     ):
-        refused("trials: none given; expected at least one trial", none)
+        with pytest.raises(InputError, match="trials: none given; expected at least one trial"):
+            none()
 
 
 CELLS = (

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from experiments.real import hiro_snap
+from hmmseg.errors import InputError
 from hmmseg.io.task import SequenceTask
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.segment import segment_sequence
@@ -21,10 +21,12 @@ def test_snap_trials_are_read_and_cropped(shared):
 
 
 def test_malformed_snap_trials_are_refused(tmp_path):
-    refused(r"R_Torques.dat: cannot be read", hiro_snap.read_trial, tmp_path)
+    with pytest.raises(InputError, match=r"R_Torques.dat: cannot be read"):
+        hiro_snap.read_trial(tmp_path)
     for name in ("R_Torques.dat", "R_CartPos.dat", "R_State.dat"):
         (tmp_path / name).write_text("0 1 2\n1 2 3\n")
-    refused("has 3 columns; expected t and six more", hiro_snap.read_trial, tmp_path)
+    with pytest.raises(InputError, match="has 3 columns; expected t and six more"):
+        hiro_snap.read_trial(tmp_path)
 
 
 # Recordings do not tell which of their changes the task names. Where their number leaves that open, as on

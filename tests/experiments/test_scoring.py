@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from experiments.recordings import list_cases, read_case
 from experiments.score_recordings import METHODS, score_case, summarise
@@ -19,6 +18,7 @@ from experiments.scoring import (
     summarise_properties,
 )
 from hmmseg.contact.decompose import subtasks
+from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.segmentation.spans import Segmentation, Span
 
@@ -72,7 +72,8 @@ def test_properties_against_truth():
 
 
 def test_a_folder_without_cases_is_refused(tmp_path):
-    refused("holds no case", list_cases, tmp_path)
+    with pytest.raises(InputError, match="holds no case"):
+        list_cases(tmp_path)
 
 
 def test_the_rules_on_the_paper_s_blocks():

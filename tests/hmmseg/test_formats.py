@@ -28,7 +28,6 @@ from file_writers import (
     write_robomimic,  # fmt: skip
 )
 from mcap.reader import make_reader
-from refusals import refused
 
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
@@ -166,7 +165,8 @@ def test_stamps_since_1970_in_another_unit_are_refused_in_any_recording(tmp_path
     if line is None:
         assert read_trial(tmp_path / "a.csv", task=task).warnings == ()
     else:
-        refused(rf"a\.csv: column t: is {line}", read_trial, tmp_path / "a.csv", task=task)
+        with pytest.raises(InputError, match=rf"a\.csv: column t: is {line}"):
+            read_trial(tmp_path / "a.csv", task=task)
 
 
 def test_interpolation_by_hand():
@@ -347,7 +347,8 @@ def test_a_lerobot_data_set_with_subtasks(tmp_path, version):
     assert held == expected
     again = read_trial(f"{tmp_path}/new#1", rig, SequenceTask(("a",), channels=("action.b",)))
     np.testing.assert_array_equal(again.channels["action.b"], 1.0)
-    refused("has subtasks already; expected no labels yet", lerobot_files, tmp_path / "new", {})
+    with pytest.raises(InputError, match="has subtasks already; expected no labels yet"):
+        lerobot_files(tmp_path / "new", {})
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from refusals import refused
 from typer.testing import CliRunner
 
 from hmmseg import example_folder
+from hmmseg.errors import InputError
 from hmmseg.hand import read as long
 from hmmseg.hand.read import LongRecording
 from hmmseg.io.rig import Rig
@@ -70,10 +70,12 @@ def test_a_fault_far_into_a_long_recording_is_named_with_its_row(repeated, tmp_p
     columns, _, rig = repeated
     back = columns | {"t": columns["t"].copy()}
     back["t"][300] = back["t"][299]
-    refused("row 301, column t", LongRecording, write(back, tmp_path / "back.npz"), rig, piece=300)
+    with pytest.raises(InputError, match="row 301, column t"):
+        LongRecording(write(back, tmp_path / "back.npz"), rig, piece=300)
     odd = columns | {"fx1": columns["fx1"].copy()}
     odd["fx1"][310] = np.inf
-    refused("row 311, column fx1", LongRecording, write(odd, tmp_path / "odd.npz"), rig, piece=100)
+    with pytest.raises(InputError, match="row 311, column fx1"):
+        LongRecording(write(odd, tmp_path / "odd.npz"), rig, piece=100)
 
 
 def test_the_command_keeps_long_recordings_on_disk(repeated, tmp_path, monkeypatch):

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fault_scene import CARTESIAN, FOLDER, FREE, JOINT, JOINTED, mended
-from refusals import refused
 
 from estimation.checks import dense
 from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, wrist_rig
@@ -63,7 +62,9 @@ MISFITS = {
 @pytest.mark.parametrize("case", MISFITS)
 def test_refused_with_what_mends_it(case):
     healthy, table, rig, line = MISFITS[case]
-    caught = refused(line, read_trial, table, rig)
+    with pytest.raises(InputError, match=line) as caught:
+        read_trial(table, rig)
+    assert "\n" not in str(caught.value)
     better, rounds = mended(rig, str(caught.value)), 0
     while True:  # one thing a time: velocities are looked at when positions are right
         try:
@@ -135,7 +136,8 @@ def test_positions_in_coarse_steps_are_told_and_not_taken_for_stuck():
 def test_hands_of_other_than_two_fingers_are_told(names, line):
     table = {k: v for k, v in CARTESIAN.items() if k not in names} | {"fx3": CARTESIAN["fx2"]}
     if line:
-        refused(line, read_trial, table, FREE)
+        with pytest.raises(InputError, match=line):
+            read_trial(table, FREE)
     else:
         assert any(
             "columns fx3 are left out: hands have two fingers" in w for w in read_trial(table, FREE).warnings
@@ -205,7 +207,8 @@ def performed():
 )  # fmt: skip
 def test_exchanged_axes_are_refused_with_what_mends_them(pairs, line):
     wrong = exchanged(CARTESIAN, pairs)
-    told = refused(line, read_trial, wrong, FREE)
+    with pytest.raises(InputError, match=line) as told:
+        read_trial(wrong, FREE)
     trial = read_trial(wrong, mended(FREE, str(told.value)))
     for name, values in read_trial(CARTESIAN, FREE).channels.items():
         np.testing.assert_array_equal(trial.channels[name], values)
@@ -295,7 +298,9 @@ def test_the_lines_mend_what_they_refuse(performed):
     for said, change, line in REFUSED.values():
         columns = change(wrist_recording(performed, PLAIN))
         table = wrist_rig(PLAIN, **said).model_dump(exclude_none=True, exclude_defaults=True)
-        told = refused(line, read_trial, columns, parse_rig(table))
+        with pytest.raises(InputError, match=line) as told:
+            read_trial(columns, parse_rig(table))
+        assert "\n" not in str(told.value)
         entry = tomllib.loads(re.sub(r" under \[\w+\].*", "", str(told.value).split("; expected ")[1]))
         if "under [gripper]" in str(told.value):
             table["gripper"] |= entry

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from estimation.identification import identify_aligned
 from experiments.wrist import ARM_RIG
 from experiments.wrist_scene import BLOCKS, Setup, performances, wrist_recording, wrist_rig
 from experiments.wrist_scene import TASK as RESTACK
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
+from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.formats import read_table
@@ -230,8 +230,10 @@ def test_memory_and_hypotheses_do_not_grow():
 
 
 def test_what_cannot_be_watched_is_refused():
-    refused("plain ordered task", Watcher, {"sequence": ["a", "b"]}, RIG)
-    refused("lag", Watcher, TASK, RIG, -1.0)
+    with pytest.raises(InputError, match="plain ordered task"):
+        Watcher({"sequence": ["a", "b"]}, RIG)
+    with pytest.raises(InputError, match="lag"):
+        Watcher(TASK, RIG, -1.0)
     with pytest.raises(ValueError, match="expected"):
         Watcher(TASK, RIG).update(0.0, [1.0])
 
@@ -359,7 +361,8 @@ def test_a_drifting_sensor_is_told_as_an_uncertain_weight(performed):
 def test_a_first_grip_without_free_motion_is_told(performed):
     _, columns = performed
     late = {name: c[columns["t"] > 1.7] for name, c in columns.items()}
-    refused("no free motion", follow_wrist, late, wrist_rig(SETUP))
+    with pytest.raises(InputError, match="no free motion"):
+        follow_wrist(late, wrist_rig(SETUP))
 
 
 def test_an_opening_is_read_as_it_comes():

@@ -14,8 +14,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from refusals import refused
 
+from hmmseg.errors import InputError
 from hmmseg.example import example_folder
 from hmmseg_cli import batch
 from hmmseg_cli.batch import recordings_in, segment_apart
@@ -111,7 +111,8 @@ def test_a_folder_stands_for_its_recordings(tmp_path):
     (tmp_path / "inner").mkdir()
     found = recordings_in([tmp_path / "b.csv", tmp_path])
     assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
-    refused("no recordings in this folder", recordings_in, [tmp_path / "inner"])
+    with pytest.raises(InputError, match="no recordings in this folder"):
+        recordings_in([tmp_path / "inner"])
 
 
 def test_the_order_of_a_set_of_names_moves_no_digit(lab):

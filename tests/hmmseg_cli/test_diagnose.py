@@ -10,7 +10,6 @@ from types import SimpleNamespace as NS
 import pandas as pd
 import pytest
 from demo_recordings import FOLDER
-from refusals import refused
 from rich.console import Console
 
 import hmmseg
@@ -34,7 +33,8 @@ def test_scales_that_contradict_each_other_are_told_before_any_search(tmp_path):
     slow = pd.read_csv(FOLDER / "trial_01.csv").assign(t=lambda table: 1.25 * table.t)
     rig = tomllib.loads((FOLDER / "rig.toml").read_text())
     line = r"times as far as their velocities carry them.*; expected t = \{from = .t., unit = 0.8"
-    refused(line, hmmseg.diagnose, slow, FOLDER / "task.toml", {k: v for k, v in rig.items() if k != "rate"})
+    with pytest.raises(hmmseg.InputError, match=line):
+        hmmseg.diagnose(slow, FOLDER / "task.toml", {k: v for k, v in rig.items() if k != "rate"})
 
 
 def test_no_trial_is_its_own_healthy_one(capsys):

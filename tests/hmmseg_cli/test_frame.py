@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
 
 import hmmseg
 from hmmseg.errors import InputError
@@ -88,11 +87,15 @@ def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
     rig.write_text('[columns]\nt = {from = "time"}\n')  # but how its files are read, as inspect writes it
     assert find_inputs([trial], other, None) == (other, rig)
     rig.write_text(hand)
-    refused(r"--task .*rig.toml: describes no task; .*swapped\?", find_inputs, [trial], rig, task)
-    refused(r"--rig .*other.toml: describes a task", find_inputs, [trial], task, other)
+    with pytest.raises(InputError, match=r"--task .*rig.toml: describes no task; .*swapped\?"):
+        find_inputs([trial], rig, task)
+    with pytest.raises(InputError, match=r"--rig .*other.toml: describes a task"):
+        find_inputs([trial], task, other)
     task.unlink()
-    refused(r"--task: missing; expected .*or a task.toml in", find_inputs, [trial], None, None)
-    refused("--rig: missing", require_rig, None, [trial])
+    with pytest.raises(InputError, match=r"--task: missing; expected .*or a task.toml in"):
+        find_inputs([trial], None, None)
+    with pytest.raises(InputError, match="--rig: missing"):
+        require_rig(None, [trial])
 
 
 def test_help_groups_commands_and_gives_examples(capsys):
@@ -147,7 +150,8 @@ def test_destinations_without_permission(tmp_path, monkeypatch):
     monkeypatch.setattr("hmmseg_cli.console.os.access", lambda path, mode: False)  # root may write anywhere
     for arguments in ({"json": str(tmp_path / "a.json")}, {"json": str(tmp_path / "b.json")},
                       {"report": tmp_path / "c.html"}, {"figures": tmp_path / "d"}):  # fmt: skip
-        refused("cannot be written", Output, "test", **arguments)
+        with pytest.raises(InputError, match="cannot be written"):
+            Output("test", **arguments)
 
 
 def test_files_appear_together_at_the_end(tmp_path):
@@ -227,6 +231,9 @@ def test_distinct_trials(tmp_path):
         path.write_text(text)
     assert distinct_trials(paths[:2]) == paths[:2]
     for twice in ([paths[0], paths[0]], [paths[0], tmp_path / "." / "a.csv"], [paths[0], paths[2]]):
-        refused(r"csv: the same trial as .*a\.csv; expected every trial once", distinct_trials, twice)
-    refused(r"absent\.csv: no such file; expected a trial", distinct_trials, [tmp_path / "absent.csv"])
-    refused("is a folder; expected a trial", distinct_trials, [tmp_path])
+        with pytest.raises(InputError, match=r"csv: the same trial as .*a\.csv; expected every trial once"):
+            distinct_trials(twice)
+    with pytest.raises(InputError, match=r"absent\.csv: no such file; expected a trial"):
+        distinct_trials([tmp_path / "absent.csv"])
+    with pytest.raises(InputError, match="is a folder; expected a trial"):
+        distinct_trials([tmp_path])

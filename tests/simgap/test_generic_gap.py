@@ -4,7 +4,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from experiments.generic_ensembles import PLANTED, TASK, Scatter, ensemble
 from experiments.generic_ensembles import made as case_of
@@ -185,7 +184,8 @@ def test_one_real_trial_says_that_it_is_weaker():
 
 def test_one_trial_of_each_kind_is_refused():
     real, sim, boundaries = made(4)
-    refused("one real and one simulated", align, real[:1], sim[:1], TASK, boundaries=boundaries)
+    with pytest.raises(InputError, match="one real and one simulated"):
+        align(real[:1], sim[:1], TASK, boundaries=boundaries)
 
 
 def test_boundaries_must_fit_the_task():

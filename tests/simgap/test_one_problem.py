@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from demo_recordings import recorded
-from refusals import refused
 
 from estimation.identification import identify_aligned
+from hmmseg.errors import InputError
 from hmmseg.segmentation.align import align
 from simgap.api import diagnose
 from simgap.gap.frame import build
@@ -77,4 +77,5 @@ def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
 
 
 def test_an_effect_that_is_misspelt_is_said():
-    refused(r"unknown effect.*force_bias", diagnose, as_recorded(), effects=("force_bais",))
+    with pytest.raises(InputError, match=r"unknown effect.*force_bias"):
+        diagnose(as_recorded(), effects=("force_bais",))

@@ -5,9 +5,9 @@ import tomllib
 
 import numpy as np
 import pytest
-from refusals import refused
 from simgap_scenes import HAND, STACK
 
+from hmmseg.errors import InputError
 from hmmseg.io.rig import parse_rig
 from simgap.gap.simulated import performed, recorded
 from simgap.patch import checked, files, replayed
@@ -77,7 +77,8 @@ def test_links_are_corrected_in_place_and_nothing_is_written_without_a_cause():
     assert rig.finger(1).links == pytest.approx((0.1224, 0.12)) and not rig.effects
     assert rig.finger(2).links == pytest.approx((0.12, 0.1188))
     assert files(RIG, {"causes": [], "effects": {}}) == {}
-    refused(r"effects\.gravity_wave", checked, {"gravity_wave": {"size": 1.0}}, "rig.toml")
+    with pytest.raises(InputError, match=r"effects\.gravity_wave"):
+        checked({"gravity_wave": {"size": 1.0}}, "rig.toml")
 
 
 OFFSETS = {"q11": (0.01, "rad"), "q12": (0.0, "rad"), "q21": (-0.008, "rad"), "q22": (0.004, "rad")}

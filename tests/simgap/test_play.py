@@ -13,12 +13,12 @@ import threading
 
 import numpy as np
 import pytest
-from refusals import refused
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from estimation.identification import identify_aligned
 from experiments.play_session import browser, find_browser, save, served, stack
+from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
@@ -149,9 +149,11 @@ def test_a_diagnosis_names_what_stands_beside(tmp_path):
     path.write_text(json.dumps(document))
     assert diagnosed(path) == {"force_lowpass": {"time_constant": 0.04}}
     path.write_text(json.dumps(document | {"causes": [], "verdict": "none"}))
-    refused("a diagnosis that names a cause", diagnosed, path)
+    with pytest.raises(InputError, match="a diagnosis that names a cause"):
+        diagnosed(path)
     path.write_text(json.dumps(document | {"causes": ["backlash"]}))
-    refused("backlash cannot be felt", diagnosed, path)
+    with pytest.raises(InputError, match="backlash cannot be felt"):
+        diagnosed(path)
     path.write_text(json.dumps({"format": "hmmseg.identify/1"}))
     assert diagnosed(path) == {}
 
@@ -254,7 +256,8 @@ def test_a_session_replaces_no_file(session, tmp_path):
     assert [session.save(tmp_path)[-1].name for _ in range(2)] == ["trial_01.csv", "trial_03.csv"]
     assert (tmp_path / "trial_02.csv").read_text() == "mine"
     (tmp_path / "rig.toml").write_text("rate = 7")
-    refused(r"rig\.toml: is there already, and not this session's", session.save, tmp_path)
+    with pytest.raises(InputError, match=r"rig\.toml: is there already, and not this session's"):
+        session.save(tmp_path)
     assert (tmp_path / "rig.toml").read_text() == "rate = 7" and len(list(tmp_path.iterdir())) == 6
 
 

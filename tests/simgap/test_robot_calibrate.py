@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from refusals import refused
 from simgap_swing import Swing, log
 
+from hmmseg.errors import InputError
 from hmmseg_cli.main import main
 from simgap.robot_effects import effects_of
 from simgap.robots.calibrate import LEAVES, calibrate
@@ -74,7 +74,8 @@ def test_what_acts_only_together_is_told_as_a_sum_and_what_does_nothing_not_at_a
 def test_one_log_is_held_out_by_halves_and_nothing_uncertain_is_said():
     body = found_of(Guessed(), [log(0, seconds=2.0, viscous=0.02)]).body()
     assert body["heldout"]["after"]["angle"] < 0.2 * body["heldout"]["before"]["angle"]
-    refused("nothing of the model is uncertain", found_of, Swing(), [log(0)])
+    with pytest.raises(InputError, match="nothing of the model is uncertain"):
+        found_of(Swing(), [log(0)])
 
 
 def test_what_no_fitted_parameter_explains_is_told():

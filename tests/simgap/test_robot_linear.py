@@ -4,7 +4,6 @@ import itertools
 
 import numpy as np
 import pytest
-from refusals import refused
 from simgap_swing import Swing, log
 
 from hmmseg.errors import InputError
@@ -259,7 +258,8 @@ def test_what_is_no_sequence_and_what_is_no_column_is_said():
         {"objects": {"block1": {"on": "ground"}}, "moves": [{"object": "block1", "to": "ground"}]}
     )
     assert isinstance(blocks, BlockTask)
-    refused("task of blocks", phases_by_task, logs, blocks)
+    with pytest.raises(InputError, match="task of blocks"):
+        phases_by_task(logs, blocks)
     with pytest.raises(InputError, match="no column force; expected torque, angle"):
         phases_by_task(logs, SequenceTask(("a", "b"), channels=("force",)))
 

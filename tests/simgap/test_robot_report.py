@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from hmmseg.errors import InputError
 from hmmseg_cli.console import Output
@@ -61,7 +60,8 @@ def test_a_history_that_is_none_names_its_line(tmp_path, line):
     file = tmp_path / "h.jsonl"
     assert history(file) == []
     file.write_text('{"date": "2026-01-01", "parameters": {}}\n' + line)
-    refused("line 2: is no run of a history", history, file)
+    with pytest.raises(InputError, match="line 2: is no run of a history"):
+        history(file)
 
 
 def test_what_was_named_stands_over_what_was_calibrated_and_of_a_set_nothing_is_told():

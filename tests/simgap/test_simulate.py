@@ -2,7 +2,6 @@ import json
 
 import numpy as np
 import pytest
-from refusals import refused
 from simgap_scenes import HAND as RIG
 from simgap_scenes import STACK
 
@@ -119,7 +118,8 @@ def test_properties_come_from_the_json_of_identify(tmp_path):
     assert read_properties(path, STACK)["block2"] == Block(0.4, 0.02, 0.015, 1.4)
     found["block2"]["height"] = None
     path.write_text(json.dumps({"properties": found}))
-    refused(r"block2\.height: found None; expected a positive number in m", read_properties, path, STACK)
+    with pytest.raises(InputError, match=r"block2\.height: found None; expected a positive number in m"):
+        read_properties(path, STACK)
 
 
 def test_what_cannot_be_performed_is_refused():

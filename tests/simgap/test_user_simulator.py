@@ -4,8 +4,8 @@ import sys
 
 import numpy as np
 import pytest
-from refusals import refused
 
+from hmmseg.errors import InputError
 from simgap.simulators.protocol import Job, Simulator, run_all
 from simgap.simulators.recording import Recording, read_recording
 from simgap.simulators.user import load_simulator, restarts
@@ -77,7 +77,8 @@ def test_a_run_that_diverges_is_none(file):
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_a_line(file, name, text, line):
-    refused(line, load_simulator, f"{file(text)}:{name}")
+    with pytest.raises(InputError, match=line):
+        load_simulator(f"{file(text)}:{name}")
 
 
 RUN = """
@@ -114,7 +115,8 @@ run.parameters, run.channels, run.timeout = parameters, channels, 0.5
 def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, line):
     simulator = load_simulator(f"{file(RUN % code)}:run")
     log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
-    caught = refused(line, run_all, simulator, [Job({"slope": 2.0}, log, None)])
+    with pytest.raises(InputError, match=line) as caught:
+        run_all(simulator, [Job({"slope": 2.0}, log, None)])
     assert "\n" not in str(caught.value) and log.t[0] == 0
 
 
@@ -135,7 +137,8 @@ def test_what_else_a_simulator_offers_is_checked_alike(file, name, code, line):
     simulator = load_simulator(f"{file(text)}:run")
     log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
     given = {"simulate_many": ([Job({"slope": 2.0}, log, None)],), "state_at": (log, 0.0), "contacts": (log,)}
-    refused(line, getattr(simulator, name), *given[name])
+    with pytest.raises(InputError, match=line):
+        getattr(simulator, name)(*given[name])
 
 
 def test_an_interrupt_stays_one_and_what_is_alike_will_do(file):
@@ -157,8 +160,10 @@ def test_a_file_called_as_a_package_does_not_stand_in_for_it(tmp_path):
 
 
 def test_a_missing_file_and_a_spec_without_a_name():
-    refused(r"names no object; expected FILE\.py:NAME", load_simulator, "robot.py")
-    refused(r"no such file missing\.py", load_simulator, "missing.py:Robot")
+    with pytest.raises(InputError, match=r"names no object; expected FILE\.py:NAME"):
+        load_simulator("robot.py")
+    with pytest.raises(InputError, match=r"no such file missing\.py"):
+        load_simulator("missing.py:Robot")
 
 
 def test_logs_with_their_own_name_for_time(tmp_path):
@@ -168,7 +173,10 @@ def test_logs_with_their_own_name_for_time(tmp_path):
     assert log.t[3] == pytest.approx(0.3) and log["y"][3] == 3 and log.name == "log.csv"
     for absent in ("time", "t"):  # a robot has no rig.toml
         told = rf'column {absent}: missing; expected times in s, or time = ".+" in map.toml, one of stamp, y'
-        refused(told, read_recording, path, ["y"], absent)
-    refused(r"log\.csv: column z: missing", read_recording, path, ["z"], "stamp")
+        with pytest.raises(InputError, match=told):
+            read_recording(path, ["y"], absent)
+    with pytest.raises(InputError, match=r"log\.csv: column z: missing"):
+        read_recording(path, ["z"], "stamp")
     path.write_text("t,y\n" + "".join(f"{0.1 * (i if i != 5 else 3)},{i}\n" for i in range(10)))
-    refused(r"row 7, column t: 0\.3 after 0\.4; expected strictly increasing", read_recording, path, ["y"])
+    with pytest.raises(InputError, match=r"row 7, column t: 0\.3 after 0\.4; expected strictly increasing"):
+        read_recording(path, ["y"])

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, wrist_rig
+from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.segmentation.align import align
 from simgap.gap.diagnose import diagnose
@@ -36,7 +36,8 @@ def test_effects_of_one_finger_are_not_thought_of(recordings):
     keys = shown_forms(candidate_names(rig))
     assert "force_lag" in keys
     assert not any("/" in key for key in keys)
-    refused(r"force_bias.*unseen by a wrist", diagnose, align(trials, TASK, rig), forced=["force_bias"])
+    with pytest.raises(InputError, match=r"force_bias.*unseen by a wrist"):
+        diagnose(align(trials, TASK, rig), forced=["force_bias"])
     assert shown(["force_bias", "force_lag"]) == ["force_lag"]
 
 
