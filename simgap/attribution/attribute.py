@@ -21,7 +21,7 @@ from simgap.attribution.heldout import (
 )
 from simgap.attribution.posterior import Forms, Model, channel_of, coordinates, fitted, forms
 from simgap.attribution.problem import Gap, Rows
-from simgap.attribution.search import Detection, detected, leniently, sought, statistic, weights
+from simgap.attribution.search import Detection, detected, sought, statistic, weights
 from simgap.attribution.verdict import (
     ALARM,
     RULED_OUT,
@@ -206,7 +206,7 @@ def attribute(
         seed: Of the draws behind intervals.
         heldout: Whether causes must shrink the gap of held-out trials, if there are several trials.
         models: Result of `sought`, if known.
-        absorbed: Shifts of the first nuisances that do not matter.
+        absorbed: Shifts of the first nuisances that do not matter; None if any may be.
 
     Raises:
         InputError: A forced effect is not among the candidates.
@@ -229,7 +229,7 @@ def attribute(
     ]
     small = None
     if gap.tolerance is not None and (detection.p_value < ALARM or forced):
-        small = _small(f, models, by_group, absorbed)
+        small = _small(f, models[0], by_group, absorbed)
 
     def ignored() -> SmallGap | None:
         chance = probabilities(sets, detection.p_value)
@@ -287,23 +287,17 @@ def _explanation(
     return Explanation(_names(f, effects), weight, _names(f, one.causes), one.known)
 
 
-def _small(
-    f: Forms, models: list[Model], by_group: np.ndarray, absorbed: np.ndarray | None
-) -> SmallGap | None:
-    """The gap's size if it does not matter: neither residuals, nor their statistic, nor what nuisances hide
-    of it do.
-    """
+def _small(f: Forms, best: Model, by_group: np.ndarray, absorbed: np.ndarray | None) -> SmallGap | None:
+    """The gap's size if it does not matter: neither residuals nor what nuisances hide of it do."""
     assert f.gap.tolerance is not None
     small = small_gap(f, np.minimum(by_group, 1.0), f.gap.tolerance)
-    if small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM:
+    if small.size >= 1.0:
         return None
     without = fitted(f, ()).x[: f.spectrum.num_nuisances]
     if chi2.sf(without @ without, without.size) < ALARM:  # they are where they never are
         return None
-    if absorbed is not None:
-        moved = np.abs(models[0].x[: absorbed.size] - without[: absorbed.size])
-        if (moved > absorbed).any():
-            return None
+    if absorbed is not None and (np.abs(best.x[: absorbed.size] - without[: absorbed.size]) > absorbed).any():
+        return None
     return small
 
 
@@ -357,33 +351,27 @@ def _examined(
     causes = tuple(j for j in effects if j in scattering or _needed(f, model, j))
     if others is not None:
         causes = _predicting(others, causes)
-    shifting = {*causes} - scattering
-    left = explained.inside if shifting else 0.0
+    share = 1 - explained.remainder
     shrinkage = None if others is None else others.how_far(causes)
-    share = 1 - explained.remainder if shrinkage is None else shrinkage.fraction
-    if shrinkage is None and others is not None and shifting:
+    if shrinkage is not None:
+        share = min(share, shrinkage.fraction)
+    elif others is not None and {*causes} - scattering:
         share = 0.0  # the held-out trials show no gap to explain
-    sure = known(left, share, detected(statistic(f, models, causes)).p_value) if causes else 0.0
+    sure = known(share, detected(statistic(f, models, causes)).p_value) if causes else 0.0
     return _Examined(model, explained, causes, sure)
 
 
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     """Drop causes without which held-out trials are predicted no worse, one at a time.
 
-    The trial that gains most does not count: an accident of one trial is no cause. What residuals say for a
-    random effect must be more than errors in the forms of the others may imitate.
+    The trial that gains most does not count: an accident of one trial is no cause.
     """
-    of = others.whole.gap.candidates
     while causes:
         gained = {}
         for j in causes:
             rest = [i for i in causes if i != j]
             gains = others.gains(causes, rest, rest)
             gained[j] = float(gains.sum() - gains[:-1].max())
-            if rest and not of[j].parameters:
-                feigned = max(of[i].form for i in rest) * others.gain(rest, ())
-                shown = gains.sum() - of[j].evidence
-                gained[j] -= max(shown, 0.0) if shown < feigned else 0.0
         least = min(gained, key=lambda j: gained[j])
         if gained[least] > POSITIVE:
             break

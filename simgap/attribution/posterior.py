@@ -21,13 +21,12 @@ from simgap.bounded import least
 #
 # The rows of a group (a channel in a part, in a band) have variance phi, usually one. The prior of log phi is
 # normal, as stated noise is a little off, and with some probability log-uniform above that: there the model
-# is off for reasons of its own. A group is as likely as not off by less than the tolerance. Averaged over
-# phi, the log density of a group grows only with the logarithm of its squares, so that no group decides alone
-# (a scale mixture of normals: West, Biometrika 74, 1987).
+# is off for reasons of its own. Averaged over phi, the log density of a group grows only with the logarithm
+# of its squares, so that no group decides alone (a scale mixture of normals: West, Biometrika 74, 1987).
 
 STATED = 0.3  # prior: sd of log variance about the stated one: noise is stated to 15 %
 OFF = 0.1  # prior: share of groups in which the model is off
-WITHIN = 0.5  # prior: share of groups in which it is off by less than the tolerance
+WITHIN = 0.5  # prior: share of groups that are off, of those that an effect frees
 NEAR, FAR = 13, 20  # numerics: points of the grid
 NEAR_BY = 3.5 * STATED  # numerics: log variance that separates the two parts of the grid
 LARGEST = 1e6  # numerics: largest variance over the stated one
@@ -53,11 +52,11 @@ class Background:
         return cls(grid, log_prior)
 
     def tolerant(self, most: np.ndarray) -> np.ndarray:
-        """Log prior (grid, G) of groups whose variance may reach `most` (G,) without it mattering."""
+        """Log prior (grid, G) of groups whose variance may as well be as large as `most` (G,)."""
         inside = (self.log_phi[:, None] > NEAR_BY) & (self.log_phi[:, None] <= np.log(most))
         number = inside.sum(0)
         share = np.where(number > 0, WITHIN, 0.0)
-        # Variances beyond the tolerance keep their prior.
+        # Larger variances keep their prior.
         usual = self.log_phi <= NEAR_BY
         taken = share * np.exp(self.log_prior[usual]).sum()
         with np.errstate(divide="ignore"):
@@ -78,7 +77,7 @@ class Background:
             energy: Sum of squares (G,) of each group.
             count: Number of rows (G,).
             shift: Log variance that the groups have in any case.
-            most: Variance (G,) up to which it does not matter; None for no tolerance.
+            most: Variance (G,) that is as likely as the stated one; None for the usual prior.
 
         Returns:
             Log density (G,) up to (2 pi)^(-count/2), and expected precision (G,).
@@ -176,7 +175,6 @@ class Forms:
         background: Prior of the groups' variances.
         product: Products (G, M, M) of the spectrum's columns.
         count: Expected squares (G,) if nothing acts.
-        lenient: Whether groups are as likely as not off by less than the tolerance.
         modes: Sets fitted so far.
     """
 
@@ -185,7 +183,6 @@ class Forms:
     background: Background
     product: np.ndarray
     count: np.ndarray
-    lenient: bool = False
     modes: dict[tuple[int, ...], Model] = field(init=False, default_factory=dict)
 
     def triangle(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -236,32 +233,17 @@ class Forms:
             background: Prior of the groups' variances, if not the usual one.
         """
         shift, background = self.shift(effects), background or self.background
-        density, precision = background.marginal(energy, self.count, shift, self.most)
+        density, precision = background.marginal(energy, self.count, shift)
         more = self.freed[list(effects)].sum(0)
         freed = more > 0
         if freed.any():
-            most = 1 + more if self.most is None else self.most + more
-            own = background.marginal(energy, self.count, shift, most)
+            own = background.marginal(energy, self.count, shift, 1 + more)
             bound, loose = float(density[freed].sum()), float(own[0][freed].sum())
             share = float(expit(loose - bound))
             precision = np.where(freed, share * own[1] + (1 - share) * precision, precision)
             both = np.logaddexp(bound, loose) - np.log(2.0)
             density = np.where(freed, both / freed.sum(), density)
         return density, precision
-
-    @cached_property
-    def most(self) -> np.ndarray | None:
-        """Variance (G,) of groups up to which it does not matter; None without a tolerance.
-
-        A part of a channel may be off by its tolerance throughout, all of it in one band.
-        """
-        rows, group = self.gap.rows, self.spectrum.group
-        if self.gap.tolerance is None or not self.lenient:
-            return None
-        place = rows.place
-        square = np.square(self.gap.tolerance / (1.0 if rows.sd is None else rows.sd))
-        whole = np.bincount(place, square)[place]
-        return 1 + np.bincount(group, whole) / self.count**2
 
     @cached_property
     def log_odds(self) -> float:

@@ -156,17 +156,6 @@ def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ..
     return float(np.logaddexp.reduce(scores) - np.log(len(RARE) + 1) - null)
 
 
-def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:
-    """Score the sets with a background in which gaps below the tolerance are as likely as not."""
-    other = replace(f, lenient=True)
-
-    def score(m: Model) -> float:
-        now, then = (each.marginal(m.effects, m.energy)[0].sum() for each in (f, other))
-        return m.score + float(then - now)
-
-    return other, [replace(m, score=score(m)) for m in models]
-
-
 def clear(value: float, most: float) -> bool:
     """Whether a statistic is surely a gap, even if a healthy one reached twice the largest seen (`most`)."""
     return max(0.0, most) < (value + float(np.log(SURE))) / 2

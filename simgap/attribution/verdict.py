@@ -158,18 +158,17 @@ def acting(sets: Sequence[Explanation], p_value: float, record: float = RECORD) 
     return {name: min(value, 1.0) for name, value in out.items()}  # rounding of the sum
 
 
-def known(left: float, explained: float, p_rest: float = 0.0) -> float:
+def known(explained: float, p_rest: float = 0.0) -> float:
     """Probability that a set's effects are the cause: they leave little of the gap.
 
-    Logistic in the logarithm of the larger share left, as far as anything is left at all: of a small gap no
-    share is certain.
+    Logistic in the logarithm of the share left, as far as anything is left at all: of a small gap no share is
+    certain.
 
     Args:
-        left: Share of the gap that the set leaves where it acts.
-        explained: Share of the whole gap that it explains, on held-out trials.
+        explained: Share of the gap that the set explains, also on held-out trials.
         p_rest: Probability that what is left is noise.
     """
-    most = expit(np.log(MOST / max(left, 1 - explained, 1e-6)) / WIDTH)
+    most = expit(np.log(MOST / max(1 - explained, 1e-6)) / WIDTH)
     return float(1 - (1 - healthy(p_rest)) * (1 - most))
 
 
@@ -215,20 +214,17 @@ class Shares:
         before, after: Squares of the residual with nuisances alone, and with the set.
         floor: Squares of the noise.
         each: Draws (D, J) of the share that each of the set's effects explains.
-        inside: Share that is left where the set shifts anything.
     """
 
     before: float
     after: float
     floor: float
     each: np.ndarray
-    inside: float
 
     @classmethod
     def of(
-        cls, before: float, after: float, floor: float, lost: np.ndarray, rng: np.random.Generator,
-        inside: float = 1.0,
-    ) -> Shares:  # fmt: skip
+        cls, before: float, after: float, floor: float, lost: np.ndarray, rng: np.random.Generator
+    ) -> Shares:
         """Divide the explained share in proportion to the squares `lost` (J,) by leaving each effect out.
 
         Shares and remainder sum to one. The noise of the squares gives the intervals.
@@ -237,7 +233,7 @@ class Shares:
         scatter = np.sqrt(2 * floor + 4 * max(after - floor, 0.0))
         drawn = after + scatter * rng.standard_normal(DRAWS)
         explained = np.clip((before - drawn) / max(before - floor, 1e-9), 0.0, 1.0)
-        return cls(before, after, floor, explained[:, None] * part, inside)
+        return cls(before, after, floor, explained[:, None] * part)
 
     @property
     def remainder(self) -> float:
@@ -252,23 +248,15 @@ class Shares:
 
 def shares(f: Forms, model: Model, noise: np.ndarray, rng: np.random.Generator) -> Shares:
     """Compute the shares of a set's effects; `noise` (G,) is the variance of each group's noise."""
-    weight, count = 1 / noise, np.append(f.count, f.spectrum.num_nuisances)
-    floor, by_group = float(count.sum()), squares_left(f, (), weight)
-    before = float(by_group.sum())
-    if not model.effects:
-        return Shares(before, before, floor, np.zeros((DRAWS, 0)), 1.0)
-    at_mode = squares_left(f, model.effects, weight, model.x)
-    at_best = squares_left(f, model.effects, weight)
-    rest = min(at_mode, at_best, key=lambda squares: float(squares.sum()))
-    after = min(float(rest.sum()), before)
-    lost = np.array([
-        max(float(squares_left(f, tuple(j for j in model.effects if j != out), weight).sum()) - after, 0.0)
-        for out in model.effects
-    ])  # fmt: skip
-    gone = np.maximum(by_group - at_mode, 0.0)
-    left = np.clip((at_mode - count) / np.maximum(by_group - count, np.sqrt(2 * count + 1)), 0.0, 1.0)
-    inside = float(gone @ left / gone.sum()) if gone.sum() > 0 else 1.0
-    return Shares.of(before, after, floor, lost, rng, inside)
+    weight, floor = 1 / noise, float(f.count.sum()) + f.spectrum.num_nuisances
+
+    def left(effects: tuple[int, ...], x: np.ndarray | None = None) -> float:
+        return float(squares_left(f, effects, weight, x).sum())
+
+    before = left(())
+    after = min(left(model.effects, model.x), before)
+    lost = [max(left(tuple(j for j in model.effects if j != out)) - after, 0.0) for out in model.effects]
+    return Shares.of(before, after, floor, np.array(lost), rng)
 
 
 # Where the gap lies: excess squares by trial, channel, part and band, with control of false discoveries.

@@ -216,15 +216,17 @@ def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
 # The smallest gap that matters: [tolerance] of rig.toml, or what its sensors could not show.
 
 SAMPLES = 0.5  # chosen: sds of one sample: a smaller shift is invisible in any single sample
-PROPERTY = 0.01  # chosen: relative error of a property that does not matter
 # cited: share of a block's width or weight: the better half of the paper's own errors (its Table 4)
 SHARE = 0.005
 
 
-def properties_tolerated(given: Problem) -> np.ndarray:
-    """Largest errors of properties (3 O,) that do not matter, in standard deviations of their prior."""
-    share = given.frame.rig.tolerance.property or PROPERTY
-    return (share * np.abs(given.centre) / given.sd).ravel()
+def properties_tolerated(given: Problem) -> np.ndarray | None:
+    """Largest errors of properties (3 O,) that do not matter, if the rig states them.
+
+    In standard deviations of their prior.
+    """
+    share = given.frame.rig.tolerance.property
+    return None if share is None else (share * np.abs(given.centre) / given.sd).ravel()
 
 
 def tolerated(given: Problem) -> np.ndarray:

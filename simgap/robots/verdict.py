@@ -161,7 +161,7 @@ def verdict_on(
     doubts = _absurd(search.composed.effects, best, causes)
     if left > MOST:
         doubts = (*doubts, f"it leaves {100 * left:.0f} % of the gap")
-    right = 0.0 if doubts else known(left, 1.0 - left)
+    right = 0.0 if doubts else known(1.0 - left)
     others = _alternatives(search, best)
     # What is too small to report, and what could replace it, is no cause and replaces none.
     small = {*best.names} - {*causes}
