@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hmmseg.errors import InputError
+from simgap.abl import ON
 from simgap.attribution.heldout import (
     POSITIVE,
     RESPONSE,
@@ -233,7 +234,7 @@ def attribute(
 
     def ignored() -> SmallGap | None:
         chance = probabilities(sets, detection.p_value)
-        certain = gap.usual and chance["none"] + chance["unknown"] <= DOUBT  # can be mended
+        certain = 'usual' not in ON and gap.usual and chance["none"] + chance["unknown"] <= DOUBT  # can be mended
         return None if certain else small
 
     if ignored() is None:  # else twins could only make it likelier that there is none
@@ -295,12 +296,14 @@ def _small(
     """
     assert f.gap.tolerance is not None
     small = small_gap(f, np.minimum(by_group, 1.0), f.gap.tolerance)
+    if small.size >= 1.0 and 'lenient' in ON:
+        return None
     if small.size >= 1.0 and np.exp(-statistic(*leniently(f, models))) < ALARM:
         return None
     without = fitted(f, ()).x[: f.spectrum.num_nuisances]
-    if chi2.sf(without @ without, without.size) < ALARM:  # they are where they never are
+    if 'chi2' not in ON and chi2.sf(without @ without, without.size) < ALARM:  # they are where they never are
         return None
-    if absorbed is not None:
+    if absorbed is not None and 'absorbed' not in ON:
         moved = np.abs(models[0].x[: absorbed.size] - without[: absorbed.size])
         if (moved > absorbed).any():
             return None
@@ -355,10 +358,10 @@ def _examined(
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
     causes = tuple(j for j in effects if j in scattering or _needed(f, model, j))
-    if others is not None:
+    if others is not None and 'predicting' not in ON:
         causes = _predicting(others, causes)
     shifting = {*causes} - scattering
-    left = explained.inside if shifting else 0.0
+    left = explained.inside if shifting and 'inside' not in ON else 0.0
     shrinkage = None if others is None else others.how_far(causes)
     share = 1 - explained.remainder if shrinkage is None else shrinkage.fraction
     if shrinkage is None and others is not None and shifting:
@@ -378,9 +381,9 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
         gained = {}
         for j in causes:
             rest = [i for i in causes if i != j]
-            gains = others.gains(causes, rest, rest)
-            gained[j] = float(gains.sum() - gains[:-1].max())
-            if rest and not of[j].parameters:
+            gains = others.gains(causes, rest, () if 'offform' in ON else rest)
+            gained[j] = float(gains.sum() - gains[:-1].max() * ('pred_max' not in ON))
+            if rest and not of[j].parameters and 'pred_feign' not in ON:
                 feigned = max(of[i].form for i in rest) * others.gain(rest, ())
                 shown = gains.sum() - of[j].evidence
                 gained[j] -= max(shown, 0.0) if shown < feigned else 0.0
@@ -399,7 +402,7 @@ def _needed(f: Forms, model: Model, effect: int) -> bool:
     of them adds. A single effect is needed if there is a gap.
     """
     others = tuple(j for j in model.effects if j != effect)
-    if not others:
+    if not others or 'needed' in ON:
         return True
     of = [f.gap.candidates[j] for j in others]
 
@@ -408,7 +411,7 @@ def _needed(f: Forms, model: Model, effect: int) -> bool:
 
     shown = model.score - fitted(f, ()).score - sum(max(c.evidence, 0.0) for c in of)
     parts = np.maximum([added(j) for j in others], np.log(RULED_OUT))
-    feigned = shown * np.average([c.form for c in of], weights=parts)
+    feigned = shown * np.average([c.form for c in of], weights=parts) * ('needed_feign' not in ON)
     return bool(added(effect) > max(np.log(RULED_OUT), feigned))
 
 
@@ -445,7 +448,9 @@ def _effects(
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
         wide = np.hypot(sd, c.scale * RESPONSE * share_of(f, model, j))
-        if examination is not None:  # only examined sets are compared between parts
+        if 'response' in ON:
+            wide = sd
+        if examination is not None and 'between' not in ON:  # only examined sets are compared between parts
             wide = np.hypot(wide, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,

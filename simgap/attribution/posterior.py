@@ -16,6 +16,7 @@ from scipy.special import expit, gammaln
 
 from simgap.attribution.problem import Gap, Spectrum, spectrum
 from simgap.bounded import least
+from simgap.abl import ON
 
 # The background: what no candidate explains, a variance of its own for each group of rows.
 #
@@ -213,7 +214,7 @@ class Forms:
     @cached_property
     def freed(self) -> np.ndarray:
         """Most additional mean variance (J, G) of each group where a candidate acts."""
-        return self._means([c.frees for c in self.gap.candidates])
+        return self._means([None if 'freed' in ON else c.frees for c in self.gap.candidates])
 
     def _means(self, values: Sequence[np.ndarray | None]) -> np.ndarray:
         """Means (J, G) of each candidate's values (n,) by group; 0 where it has none."""
@@ -297,7 +298,7 @@ def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
         return f.modes[effects]
     own = quadratic_forms(f, effects)
     modes = [mode(f, own, np.ones(f.count.size))]
-    if effects:
+    if effects and 'one_start' not in ON:
         x = np.zeros(own.low.size)
         for j, mine in own.blocks.items():
             c = f.gap.candidates[j]

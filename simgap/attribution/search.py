@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
+from simgap.abl import ON
 from simgap.attribution.posterior import (
     Background,
     Forms,
@@ -53,8 +54,8 @@ def sought(f: Forms, beam: int = BEAM) -> list[Model]:
     while True:
         best = max(m.score for m in seen.values())
         ranked = sorted(seen.values(), key=lambda m: -m.score)
-        leading = [alone, *[m for m in ranked if m.score > best - WINDOW][:beam]]
-        leading += [m for m in ranked if len(m.effects) == 1][: 2 if beam > 1 else 0]
+        leading = [*([] if 'alone' in ON else [alone]), *[m for m in ranked if m.score > best - WINDOW][:beam]]
+        leading += [m for m in ranked if len(m.effects) == 1][: 2 if beam > 1 and 'singles' not in ON else 0]
         todo = [m for m in leading if m.effects not in opened and len(m.effects) < MOST]
         if not todo:
             break
@@ -150,11 +151,11 @@ def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ..
     null = fitted(replace(f, background=Background.usual(off=1e-9)), acting).score
     usual = [f.marginal(m.effects, m.energy)[0].sum() for m in wider]
     scores = [m.score for m in wider]
-    for share in RARE:
+    for share in () if 'rare' in ON else RARE:
         other = Background.usual(off=share)
         scores += [m.score + float(f.marginal(m.effects, m.energy, other)[0].sum() - now)
                    for m, now in zip(wider, usual, strict=True)]  # fmt: skip
-    return float(np.logaddexp.reduce(scores) - np.log(len(RARE) + 1) - null)
+    return float(np.logaddexp.reduce(scores) - np.log((0 if 'rare' in ON else len(RARE)) + 1) - null)
 
 
 def leniently(f: Forms, models: list[Model]) -> tuple[Forms, list[Model]]:

@@ -183,6 +183,9 @@ def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:
         if one.causes:
             chance[one.causes] = chance.get(one.causes, 0.0) + one.known * one.weight
     best = max(chance, key=lambda causes: chance[causes], default=())
+    from simgap.abl import ON
+    if 'subset' in ON:
+        return best
     enough = [c for c, value in chance.items() if {*c} <= {*best} and value * RULED_OUT > chance[best]]
     return min(enough, key=lambda c: (len(c), -chance[c]), default=())
 
@@ -194,7 +197,8 @@ def alike(sets: Sequence[Explanation], causes: tuple[str, ...]) -> tuple[str, ..
     """
     holding = [one for one in sets if {*causes} <= {*one.effects}]
     best = max(holding, key=lambda one: one.weight)
-    small, partners = {*best.effects} - {*causes}, set[str]()
+    from simgap.abl import ON
+    small, partners = {*best.effects} - {*causes} if 'small_alike' not in ON else set(), set[str]()
     for one in sets:
         large = {*one.effects} - small
         if one.weight * RULED_OUT > best.weight and len(large) <= len(causes):
@@ -259,7 +263,8 @@ def shares(f: Forms, model: Model, noise: np.ndarray, rng: np.random.Generator) 
         return Shares(before, before, floor, np.zeros((DRAWS, 0)), 1.0)
     at_mode = squares_left(f, model.effects, weight, model.x)
     at_best = squares_left(f, model.effects, weight)
-    rest = min(at_mode, at_best, key=lambda squares: float(squares.sum()))
+    from simgap.abl import ON
+    rest = at_mode if 'at_mode' in ON else min(at_mode, at_best, key=lambda squares: float(squares.sum()))
     after = min(float(rest.sum()), before)
     lost = np.array([
         max(float(squares_left(f, tuple(j for j in model.effects if j != out), weight).sum()) - after, 0.0)

@@ -390,7 +390,8 @@ def attributed(
     if not forced:
         gap, models = _after_first(found, f, models)
         leading = [c for j in models[0].effects if _shifts_signals(c := gap.candidates[j])]
-        if leading:
+        from simgap.abl import ON
+        if leading and 'together' not in ON:
             joint = _together(found, leading)
             left = scatters(
                 found.problem, found.problem.nuisances.left(joint.residual),
@@ -410,7 +411,8 @@ def _after_first(found: Search, f: Forms, models: list[Model]) -> tuple[Gap, lis
     gap, best = f.gap, models[0]
     shifting = [j for j in best.effects if _shifts_signals(gap.candidates[j])]
     first = min(shifting, key=lambda j: fitted(f, tuple(i for i in best.effects if i != j)).score, default=-1)
-    if first < 0 or statistic(f, models, (first,)) < NIL:
+    from simgap.abl import ON
+    if 'after_first' in ON or first < 0 or statistic(f, models, (first,)) < NIL:
         return gap, models
     one = found.fits[first]
     keys = [k for each in found.fits if name_of(k := each.effects[0]) != gap.candidates[first].name]
