@@ -18,7 +18,7 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS, Column
 from hmmseg.levels import SURE
@@ -167,8 +167,7 @@ def check_lengths(trial: Trial, rig: Rig) -> list[Finding]:
 
 def check_angles(trial: Trial, rig: Rig) -> list[Finding]:
     """Joint angles in degrees: no link winds twice around."""
-    named = [name for name in ("q11", "q12", "q21", "q22") if name in trial.channels]
-    joints = [name for name in named if np.isfinite(trial.channels[name]).any()]
+    joints = [name for name in JOINTS if np.isfinite(trial.channels.get(name, np.nan)).any()]
     widest = {name: float(np.nanmax(np.abs(trial.channels[name]))) for name in joints}
     wound = {name: value for name, value in widest.items() if value > WINDING}
     if not wound:
