@@ -42,6 +42,12 @@ def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     return float(np.quantile(values[keep], 0.5, weights=weights[keep], method="inverted_cdf"))
 
 
+def extent(values: np.ndarray) -> float:
+    """Range of the finite values, 0 of none."""
+    there = values[np.isfinite(values)]
+    return float(np.ptp(there)) if there.size else 0.0
+
+
 def median_of_known(values: np.ndarray, otherwise: float = np.nan) -> float:
     """Median of the finite values."""
     there = values[np.isfinite(values)]
