@@ -29,8 +29,8 @@ from scipy.special import log_ndtr
 from hmmseg.densities import log_student
 from hmmseg.levels import SURE
 from hmmseg.segmentation.boundaries import (
+    NODES,
     ONSET,
-    POINTS,
     BoundaryPosterior,
     Crossing,
     Kind,
@@ -254,7 +254,6 @@ def _seen(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, 
     t, making = contacts[0].t, change.making
     switches = np.array([switch_probability(c, change.log_prior, making) for c in contacts])
     combined = crossing_density if making else first_of
-    inner = (np.arange(POINTS) + 0.5) / POINTS
     times, masses = [], []
     for n in range(t.size - 1):
         width = float(t[n + 1] - t[n])
@@ -265,7 +264,7 @@ def _seen(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, 
             density = combined(deciding if all(x.known for x in deciding) else [], width)
             if not np.isfinite(density).all():
                 density = combined([], width)
-            times.append(t[n] + inner * width)
+            times.append(t[n] + NODES * width)
             masses.append(mass * density)
     return np.concatenate(times), np.concatenate(masses)
 
