@@ -39,12 +39,11 @@ import numpy as np
 from estimation.design import RISE, Design, PadDoubt
 from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
 from estimation.pads import MISSTATED, SLOPE_SD
-from hmmseg.contact.decompose import ON_GROUND, stack
+from hmmseg.contact.decompose import ON_GROUND
 from hmmseg.errors import InputError
 from hmmseg.hand.plausibility import scale_to_velocity
 from hmmseg.hand.sensing import WHITE
 from hmmseg.io.rig import Rig
-from hmmseg.io.task import GROUND
 from hmmseg.io.trial import position_pairs
 from hmmseg.levels import CERTAIN, MOVED
 from hmmseg.robust import robust_sd
@@ -74,11 +73,15 @@ FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
 @dataclass(frozen=True)
 class Grip:
-    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move."""
+    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move.
+
+    `beneath`: objects from its support down to the ground.
+    """
 
     move: int
     key: str
     object: str
+    beneath: tuple[str, ...]
     subtask: int
     x1: float
     x2: float
@@ -272,21 +275,22 @@ def _motion(aligned: AlignedTrials) -> Iterator[Tie]:
 
 def _grips(a: WeighedTrial, aligned: AlignedTrials, present: np.ndarray) -> Iterator[Grip]:
     """Where the fingertips hold each standing block."""
+    s = a.signals
     for move, grip in a.grips.items():
-        ground = [s for s in aligned.subtasks if s.move == move and s.state == ON_GROUND and present[s.index]]
+        steps = [each for each in aligned.subtasks if each.move == move and each.state == ON_GROUND]
+        ground = [each for each in steps if present[each.index]]
         for key, of in (("pickup", ground[:1]), ("place", ground[1:])):
-            s = a.signals
             weight = grip[key].mean(axis=0) * np.isfinite(s.x1 + s.x2 + s.y)
             if of and weight.any():
                 x1, x2, y = (float(weight @ np.nan_to_num(v) / weight.sum()) for v in (s.x1, s.x2, s.y))
-                yield Grip(move, key, of[0].object or "", of[0].index, x1, x2, y)
+                yield Grip(move, key, of[0].object or "", of[0].beneath, of[0].index, x1, x2, y)
 
 
 def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[Tie]:
     """No fingertip enters the space of a standing block: by how far one does in the median trial."""
-    task, every = aligned.task, []
+    every = []
     for a, one in zip(weighed, aligned.trials, strict=True):
-        s, deepest, support = a.signals, 0.0, dict(task.initial)
+        s, deepest = a.signals, 0.0
         edges = [one.signals.t[0], *(b.quantile(0.5) for b in one.boundaries), one.signals.t[-1]]
         spans = list(pairwise(np.maximum.accumulate(edges)))
         grips = list(_grips(a, aligned, one.present))
@@ -299,9 +303,8 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
             else:
                 after = [k for k in of_it if k > grip.subtask]
                 since, until = end, spans[min(after)][0] if after else s.t[-1] + 1
-                support[grip.object] = task.performed[grip.move].to
             at = (s.t > since + APART) & (s.t < until - APART)
-            floor = -np.inf if support[grip.object] == GROUND else grip.y - MOVED
+            floor = grip.y - MOVED if grip.beneath else -np.inf
             for x, y in ((s.x1, s.y1), (s.x2, s.y2)):
                 within = at & (y < grip.y) & (y > floor)
                 depth = np.minimum(x - grip.x1, grip.x2 - x)[within]
@@ -322,16 +325,14 @@ def _support(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterato
     task, off = aligned.task, dict[tuple[str, str], list[float]]()
     for a, one in zip(weighed, aligned.trials, strict=True):
         grips = {(grip.move, grip.key): grip for grip in _grips(a, aligned, one.present)}
-        support = dict(task.initial)
-        for (move, key), grip in grips.items():
-            if key == "place":
-                support[grip.object] = task.performed[move].to
-            below = support[grip.object]
-            moves = [k for k, each in enumerate(task.performed) if each.object == below]
-            before = [k for k in moves if k < move]
-            there = (before[-1], "place") if before else (min(moves, default=-1), "pickup")
-            if (other := grips.get(there)) is not None:  # where it stands meanwhile
-                off.setdefault((grip.object, below), []).append(max(other.x1 - grip.x2, grip.x1 - other.x2))
+        for (move, _), grip in grips.items():
+            for below in grip.beneath[:1]:
+                moves = [k for k, each in enumerate(task.performed) if each.object == below]
+                before = [k for k in moves if k < move]
+                there = (before[-1], "place") if before else (min(moves, default=-1), "pickup")
+                if (other := grips.get(there)) is not None:  # where it stands meanwhile
+                    miss = max(other.x1 - grip.x2, grip.x1 - other.x2)
+                    off.setdefault((grip.object, below), []).append(miss)
     pair, miss = max(
         ((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0.0)
     )
@@ -347,13 +348,9 @@ def _level(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], design: Desi
     heights = _heights(design)
     off: dict[tuple[int, str], list[float]] = {}
     for a, one in zip(weighed, aligned.trials, strict=True):
-        support = dict(aligned.task.initial)
         for grip in _grips(a, aligned, one.present):
-            if grip.key == "place":
-                support[grip.object] = aligned.task.performed[grip.move].to
-            beneath = stack(support, grip.object)
-            if all(name in heights for name in beneath):
-                bottom = sum(heights[name] for name in beneath)
+            if all(name in heights for name in grip.beneath):
+                bottom = sum(heights[name] for name in grip.beneath)
                 above, below = grip.y - bottom - heights.get(grip.object, np.inf), bottom - grip.y
                 far = max(above, 0.0) if above > below else min(-below, 0.0)
                 off.setdefault((grip.move, grip.key), []).append(far)

@@ -9,7 +9,7 @@ its friction against the support (`ground_friction`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -277,11 +277,7 @@ class FrictionPosterior:
         if self.mu_draws is not None:
             out |= summary(self.mu_draws, "1")
         if self.slip is not None:
-            out["slip"] = {
-                "seen": self.slip.seen,
-                "probability": self.slip.probability,
-                "log_bayes_factor": self.slip.log_bayes_factor,
-            }
+            out["slip"] = asdict(self.slip)
         if self.ground is not None:
             out["ground"] = summary(self.ground.mu_draws, "1") | {"support": self.ground.support}
         return out

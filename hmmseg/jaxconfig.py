@@ -91,8 +91,6 @@ def double_precision(function: Callable[P, R]) -> Callable[P, R]:
         import jax
 
         keep_programs()
-        if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
-            return function(*args, **kwargs)
         with jax.enable_x64(True):
             return function(*args, **kwargs)
 

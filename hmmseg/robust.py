@@ -39,9 +39,13 @@ def runs(found: np.ndarray) -> list[tuple[int, int]]:
 def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     """The finite value at which half of the total weight is reached."""
     keep = np.isfinite(values) & (weights > 0)
-    order = np.argsort(values[keep])
-    cumulative = np.cumsum(weights[keep][order])
-    return float(values[keep][order][np.searchsorted(cumulative, cumulative[-1] / 2)])
+    return float(np.quantile(values[keep], 0.5, weights=weights[keep], method="inverted_cdf"))
+
+
+def extent(values: np.ndarray) -> float:
+    """Range of the finite values, 0 of none."""
+    there = values[np.isfinite(values)]
+    return float(np.ptp(there)) if there.size else 0.0
 
 
 def median_of_known(values: np.ndarray, otherwise: float = np.nan) -> float:
@@ -58,3 +62,8 @@ def bridged(values: np.ndarray, t: np.ndarray | None = None) -> np.ndarray:
     there = np.isfinite(values)
     t = np.arange(values.size) if t is None else t
     return values if there.all() else np.interp(t, t[there], values[there])
+
+
+def filled(values: np.ndarray) -> np.ndarray:
+    """The same over samples, zeros if all are missing."""
+    return bridged(values) if np.isfinite(values).any() else np.zeros(values.size)

@@ -219,22 +219,18 @@ def distinct_trials(paths: Sequence[Path]) -> list[Path]:
     for given in paths:
         file, part = split_part(given)
         kind_of(file)
-        parts = [part] if part is not None else parts_of(given)
+        parts, digest = [part] if part is not None else parts_of(given), str(file.resolve())
+        if not file.is_dir():
+            with named(str(file)), file.open("rb") as opened:
+                digest = hashlib.file_digest(opened, "sha256").hexdigest()
         for name in parts or [None]:
             path = given if name is None or name == part else given.with_name(f"{given.name}#{name}")
-            content = f"{_digest(file)}#{name or ''}"
+            content = f"{digest}#{name or ''}"
             if content in seen:
                 raise InputError(str(path), f"the same trial as {seen[content]}", "every trial once")
             seen[content] = path
             out.append(path)
     return out
-
-
-def _digest(path: Path) -> str:
-    if path.is_dir():
-        return str(path.resolve())
-    with named(str(path)), path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 TASK_KEYS = {"objects", "moves", "sequence"}  # a task has one of them

@@ -21,8 +21,8 @@ def demo(figures: opt.DemoFigures = Path("demo"), json: opt.Json = None, seed: o
         folder = example_folder()
         trials, actual = sorted(folder.glob("trial_*.csv")), folder / "actual.toml"
         task, rig = read_task(folder / "task.toml"), read_rig(folder / "rig.toml")
-        body = identify.run(out, trials, folder / "task.toml", folder / "rig.toml", Estimator.BAYES, actual)
         assert isinstance(task, BlockTask)
+        body = identify.run(out, trials, task, rig, Estimator.BAYES, actual)
         rigid = rig.fingertip.model_copy(update={"normal_stiffness": float("inf")})
         out.print("\nThe same recordings, with fingertips assumed rigid as in the paper:")
         out.report = finding

@@ -28,29 +28,26 @@ def identify(
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
     with Output("identify", json=json, figures=figures, report=report, seed=seed, quiet=quiet) as out:
         found, hand = find_inputs(trials, task, rig)
-        if not isinstance(read_task(found), BlockTask):
+        description = read_task(found)
+        if not isinstance(description, BlockTask):
             problem = "a plain ordered task has no blocks to identify"
             raise InputError(str(found), problem, "objects and moves")
-        out.finish(run(out, trials, found, require_rig(hand, trials), method, actual))
+        out.finish(run(out, trials, description, read_rig(require_rig(hand, trials)), method, actual))
 
 
 def run(
-    out: Output, trials: Sequence[Path], task: Path, rig: Path, method: Estimator, actual: Path | None
+    out: Output, trials: Sequence[Path], task: BlockTask, hand: Rig, method: Estimator, actual: Path | None
 ) -> dict[str, Any]:
     """Identify, write table, figures and page to the destinations of `out`, and return the document."""
-    paths = distinct_trials(trials)
-    description = read_task(task)
-    assert isinstance(description, BlockTask)
     from estimation.report import compare, disagreements, properties_table, read_actual
 
-    hand = read_rig(rig)
-    measured = None if actual is None else read_actual(actual, description.objects)
+    paths, found = distinct_trials(trials), None
+    measured = None if actual is None else read_actual(actual, task.objects)
     recordings = read_trials(out, paths, hand)
-    found = None
     if method is Estimator.PAPER:
-        body, segmentations = _paper(out, recordings, description, hand)
+        body, segmentations = _paper(out, recordings, task, hand)
     else:
-        found = _bayes(out, recordings, description, hand)
+        found = _bayes(out, recordings, task, hand)
         body, segmentations = found.to_json(), found.segmentations
     if measured is not None:
         body["actual"] = compare(body["properties"], measured, hand.tolerance.property or 0.0)
@@ -94,17 +91,11 @@ def _paper(
 
 def _bayes(out: Output, recordings: Sequence[Trial], task: BlockTask, hand: Rig) -> Identification:
     from estimation.identification import identify_aligned
+    from estimation.sampler import CHUNK, MAX_STEPS
     from hmmseg.segmentation.align import align
 
     aligned = align(recordings, task, hand)
-    with out.progress("sampling the posterior", total=100) as advance:
-        done = 0
-
-        def progress(step: int, of: int) -> None:
-            nonlocal done
-            advance(100 * step // of - done)
-            done = 100 * step // of
-
-        found = identify_aligned(aligned, out.seed, progress)
+    with out.progress("sampling the posterior", total=MAX_STEPS) as advance:
+        found = identify_aligned(aligned, out.seed, lambda *_: advance(CHUNK))
     out.warn(*found.warnings)
     return found

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 WHERE = "standard input"
 COMMENT = tuple(sign.encode() for sign in COMMENTS)
+TIME = LATEST, "time", "a time in s"
+READING = LARGEST, "reading of a hand's sensor", f"at most {LARGEST:.0g} in SI units"
 
 
 def _text(line: bytes) -> str:
@@ -63,7 +65,6 @@ class Rows:
             self._scales.append((entry.sign * entry.size, entry.offset))
             if entry.unit is None:
                 self._unstated.append(len(self._picked) - 1)
-        self._plain = self._is_plain()
 
     def next(self) -> tuple[float, Sequence[float]] | None:
         """The next row; None at the end of the stream."""
@@ -86,15 +87,14 @@ class Rows:
             values = [math.nan if i < 0 else float(cells[i]) for i in self._picked]
         except ValueError:
             values = [self._number_in(cells, i) for i in self._picked]
-        if not math.isfinite(sum(values)):
-            self._check(values, cells)
-        if not self._plain:
-            values = [s * v + o for v, (s, o) in zip(values, self._scales, strict=True)]
+        if math.isnan(values[0]):
+            raise InputError(self._cell(self._picked[0]), "missing", "a time in s")
+        for i in (i for i, value in zip(self._picked, values, strict=True) if math.isinf(value)):
+            raise self._wrong(i, cells)
+        values = [s * v + o for v, (s, o) in zip(values, self._scales, strict=True)]
         for i, value in enumerate(values):
-            if abs(value) > (LARGEST if i else LATEST):
-                kind, most = ("reading of a hand's sensor", f"at most {LARGEST:.0g} in SI units")
-                if not i:
-                    kind, most = "time", "a time in s"
+            limit, kind, most = READING if i else TIME
+            if abs(value) > limit:
                 raise InputError(self._cell(self._picked[i]), f"{value:.3g} is no {kind}", most)
         return values[0], values[1:]
 
@@ -113,11 +113,7 @@ class Rows:
             unit = units.get(self._names[self._picked[at]])
             if unit is not None:
                 self._scales[at] = (self._scales[at][0] * si_factor(unit), self._scales[at][1])
-        self._plain = self._is_plain()
         return bool(units)
-
-    def _is_plain(self) -> bool:
-        return all(scale == (1.0, 0.0) for scale in self._scales) and -1 not in self._picked
 
     def _number_in(self, cells: list[str], i: int) -> float:
         """A cell that is not a plain number: empty, quoted, with a decimal comma, or an ISO stamp, which
@@ -142,10 +138,3 @@ class Rows:
     def _wrong(self, i: int, cells: list[str]) -> InputError:
         problem = f"{cells[i].strip()[:60]!r} is not a finite number"
         return InputError(self._cell(i), problem, "a number or an empty cell")
-
-    def _check(self, values: list[float], cells: list[str]) -> None:
-        if math.isnan(values[0]):
-            raise InputError(self._cell(self._picked[0]), "missing", "a time in s")
-        for i, value in zip(self._picked, values, strict=True):
-            if math.isinf(value):
-                raise self._wrong(i, cells)

@@ -33,6 +33,7 @@ from hmmseg.io.trial import (
 )
 from hmmseg.io.units import UNITS, Column, measures, unit_in_name
 from hmmseg.levels import GAP
+from hmmseg.robust import extent
 
 BUCKETS = 24  # numerics: of a small plot
 
@@ -267,7 +268,7 @@ def _plane(found: Mapping[str, str], table: Table) -> tuple[str, str]:
         return "x", "y"
     if not all(np.isfinite(values).any() for a in there for values in pairs[a]):
         return "x", "y"
-    travel = {a: max(float(np.nanmax(values) - np.nanmin(values)) for values in pairs[a]) for a in there}
+    travel = {a: max(map(extent, pairs[a])) for a in there}
     moves = [a for a in there if travel[a] > MOVES * max(travel.values())]
     up = "z" if "z" in moves else "y"
     apart = {a: abs(float(np.nanmedian(pairs[a][1]) - np.nanmedian(pairs[a][0]))) for a in there if a != up}

@@ -18,11 +18,11 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
-from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS, Column
 from hmmseg.levels import SURE
-from hmmseg.robust import runs, white_sd
+from hmmseg.robust import extent, runs, white_sd
 
 SLOWEST = 2.0  # limit: [Hz]; hands are recorded at 10 Hz at least
 FASTEST = 2e4  # limit: [Hz]; sampling rate of a hand's or a robot's sensors
@@ -141,11 +141,8 @@ def check_lengths(trial: Trial, rig: Rig) -> list[Finding]:
     """Positions in mm or cm (no hand travels so far), or in km."""
     gripper = rig.gripper
     names = ("x1", "y1", "x2", "y2") if gripper is None else gripper.position.values()
-    travels = {
-        name: float(np.nanmax(values) - np.nanmin(values))
-        for name, values in trial.channels.items()
-        if name in names and np.isfinite(values).any()
-    }  # fmt: skip
+    travels = {name: extent(values) for name, values in trial.channels.items()
+               if name in names and np.isfinite(values).any()}  # fmt: skip
     name, travel = max(travels.items(), key=lambda item: item[1], default=("", 0.0))
     if travel > REACH:
         unit, text = "mm", "mm"
@@ -167,8 +164,7 @@ def check_lengths(trial: Trial, rig: Rig) -> list[Finding]:
 
 def check_angles(trial: Trial, rig: Rig) -> list[Finding]:
     """Joint angles in degrees: no link winds twice around."""
-    named = [name for name in ("q11", "q12", "q21", "q22") if name in trial.channels]
-    joints = [name for name in named if np.isfinite(trial.channels[name]).any()]
+    joints = [name for name in JOINTS if np.isfinite(trial.channels.get(name, np.nan)).any()]
     widest = {name: float(np.nanmax(np.abs(trial.channels[name]))) for name in joints}
     wound = {name: value for name, value in widest.items() if value > WINDING}
     if not wound:

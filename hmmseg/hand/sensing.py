@@ -23,7 +23,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.trial import Trial, position_pairs
 from hmmseg.io.units import UNITS
 from hmmseg.levels import SURE
-from hmmseg.robust import coarse_step, robust_sd, runs, white_sd
+from hmmseg.robust import coarse_step, extent, robust_sd, runs, white_sd
 
 NEAR = 0.3  # limit: relative error of a stated noise; units differ by factors of 4 and more
 LIGHTEST, HEAVIEST = 0.08, 30.0  # limit: [kg] of a gripper with everything below its sensor
@@ -156,7 +156,7 @@ def remove_faults(trial: Trial, rig: Rig) -> Trial:
             fault, stuck = _find_repeats(name, trial.t, seen, names, noise, rates.get(name))
             channels[name][stuck] = np.nan
             found += [] if fault is None else [fault]
-    still = [rate for rate in rates.values() if _range(seen[rate]) == 0]
+    still = [rate for rate in rates.values() if extent(seen[rate]) == 0]
     if still and len(still) == len(rates) and not all(_rests(seen[name]) for name in rates):
         found.append(Fault(", ".join(still), "stand still though positions move, and are left out"))
         channels |= {rate: np.full(trial.t.size, np.nan) for rate in still}
@@ -272,7 +272,7 @@ def _is_swept(at: np.ndarray, t: np.ndarray, values: np.ndarray, rate: np.ndarra
     v, steps = np.nan_to_num(rate[at]), np.diff(t[at])
     way = float(np.ptp(np.cumsum(steps * (v[1:] + v[:-1]) / 2)))
     by_noise = white_sd(known, 1) * float(np.median(steps)) * np.sqrt(steps.size)
-    return bool(way > max(SWEPT * _range(values), SURE * by_noise))
+    return bool(way > max(SWEPT * extent(values), SURE * by_noise))
 
 
 def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, np.ndarray],
@@ -286,7 +286,7 @@ def _chance_of_repeat(name: str, value: float, at: np.ndarray, seen: dict[str, n
     alive = [own] if np.isfinite(own).sum() > MIN_ALIVE else [v for v in others if not _rests(v)]
     waits = all(_rests(v, at) for v in others)
     scatter = whiteness(alive) <= SCATTERS or (stated is not None and not waits)
-    if not any(_range(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
+    if not any(extent(v) > 0 for v in alive) or not scatter or (waits and name not in FORCE_CHANNELS):
         return 1.0
     return _share_of_repeats([own, *others])
 
@@ -307,13 +307,7 @@ def _rests(values: np.ndarray, at: np.ndarray | slice = slice(None)) -> bool:
     """Whether (a stretch of) a channel mostly repeats itself, up to rounding."""
     stretch = values[at]
     steps = np.diff(stretch[np.isfinite(stretch)])
-    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * _range(values)) > 0.5)
-
-
-def _range(values: np.ndarray) -> float:
-    """Range of a channel's readings, 0 of none."""
-    there = values[np.isfinite(values)]
-    return float(np.ptp(there)) if there.size else 0.0
+    return not steps.size or bool(np.mean(np.abs(steps) <= ROUNDING * extent(values)) > 0.5)
 
 
 def _remove_leaps(t: np.ndarray, channels: dict[str, np.ndarray], rates: dict[str, str]) -> list[Fault]:

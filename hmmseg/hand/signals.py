@@ -196,19 +196,16 @@ LONGEST = 4  # chosen: samples that a drive's difference spans at most
 ALIKE = 0.1
 
 
-def timely(signals: Signals, trial: Trial, rig: Rig) -> Signals:
+def timely(signals: Signals, trial: Trial) -> Signals:
     """The signals with central differences instead of velocities that are late, or missing altogether."""
     dead = any(not np.isfinite(trial.channels[rate]).any() for _, rate in position_pairs(trial))
-    return differenced(signals) if dead or come_late(trial, rig) else signals
+    return differenced(signals) if dead or come_late(trial) else signals
 
 
-def come_late(trial: Trial, rig: Rig) -> bool:
+def come_late(trial: Trial) -> bool:
     """Whether a trial's velocities are backward differences of its positions."""
-    names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
-    rates = [f"d{n}" if rig.jointed else f"v{n}" for n in names]
-    pairs = [(trial.channels[n], trial.channels[r]) for n, r in zip(names, rates, strict=True)
-             if r in trial.channels]  # fmt: skip
-    return bool(pairs) and all(late_differences(trial.t, *pair) for pair in pairs)
+    c, pairs = trial.channels, position_pairs(trial)
+    return bool(pairs) and all(late_differences(trial.t, c[place], c[rate]) for place, rate in pairs)
 
 
 def differenced(signals: Signals) -> Signals:
@@ -265,7 +262,7 @@ def with_heights(signals: Signals, trial: Trial, rig: Rig) -> Signals:
     A height takes four link angles: if two readings in five are missing, all four are present in one sample
     of eight. Only for decisions about a fraction of the hand's travel, as interpolation has its own error.
     """
-    names = ("q11", "q12", "q21", "q22") if rig.jointed else ("y1", "y2")
+    names = JOINTS if rig.jointed else ("y1", "y2")
     known = {name: np.isfinite(trial.channels[name]) for name in names}
     if all(k.all() for k in known.values()) or not all(k.any() for k in known.values()):
         return signals

@@ -28,7 +28,7 @@ from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warning
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import MOVED, SURE
-from hmmseg.robust import bridged, robust_sd, runs
+from hmmseg.robust import bridged, extent, robust_sd, runs
 
 WIDEST = 1.0  # limit: m; no parallel gripper opens further
 NARROW = 2e-4  # limit: m; an opening that changes less does not move
@@ -40,7 +40,7 @@ def check_gripper(trial: Trial, rig: Rig) -> list[Finding]:
     gripper = rig.wrist
     for name in gripper.opening:
         values = trial.channels[name]
-        widest, swing = float(np.nanmax(np.abs(values))), _travel(trial, name)
+        widest, swing = float(np.nanmax(np.abs(values))), extent(values)
         if swing > WIDEST:
             unit, text = ("cm", 'cm (or "in")') if swing < 15 else ("mm", "mm (or %)")
             problem = f"swings by {swing:.4g} m, a gripper by less than {WIDEST:g} m: it looks like {text}"
@@ -57,8 +57,8 @@ def _cancelling(trial: Trial, rig: Rig) -> list[Finding]:
     if len(names) < 2:
         return []
     first, second = (trial.channels[name] for name in names)
-    total, least = first + second, min(_travel(trial, name) for name in names)
-    if not np.isfinite(total).any() or np.nanmax(total) - np.nanmin(total) > CANCELLED * least:
+    total = first + second
+    if not np.isfinite(total).any() or extent(total) > CANCELLED * min(extent(first), extent(second)):
         return []
     name = names[int(np.nanmedian(second) < np.nanmedian(first))]
     problem = f"moves while {' + '.join(names)} stays as it is: it counts the other way"
@@ -75,10 +75,6 @@ def _one_finger(rig: Rig) -> list[Finding]:
         return []
     problem = "is named after one finger, and would show half of the opening: widths halved"
     return [Finding(name, problem, changed([name], rig, unit=2.0), certain=False)]
-
-
-def _travel(trial: Trial, name: str) -> float:
-    return float(np.nanmax(trial.channels[name]) - np.nanmin(trial.channels[name]))
 
 
 def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
@@ -180,6 +176,16 @@ def contradiction(trial: Trial, rig: Rig, pose: Pose, opening: np.ndarray, held:
     problem = f"say that the hand's load pulls along {across} and never along {up}: axes exchanged"
     where = f"{trial.file}: columns {position[up]}, {position[across]}"
     return InputError(where, problem, f"position = {{{text}}} under [gripper]")
+
+
+def opening_of(trial: Trial, gripper: Gripper) -> np.ndarray:
+    """Opening (num_timesteps,) [m], gaps bridged."""
+    return np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
+
+
+def width_error(grips: list[Grip]) -> float:
+    """Uncertainty [m] of the openings at which the pads touch, 0 without any grip."""
+    return float(np.sqrt(np.mean([grip.width_sd**2 for grip in grips]))) if grips else 0.0
 
 
 def _lifts_all(loads: list[float | None]) -> bool:
@@ -312,7 +318,7 @@ def two_fingers(trial: Trial, rig: Rig) -> Trial:
     gripper = rig.wrist
     trial = _with_still_axes(trial, rig)
     pose = pose_of(trial, gripper)
-    opening = np.sum([bridged(trial.channels[name], trial.t) for name in gripper.opening], axis=0)
+    opening = opening_of(trial, gripper)
     pressing = grip_force_of(trial.channels, gripper)
     held = find_grips(trial, rig, pose, opening, pressing)
     signs: tuple[str, ...] = ()
@@ -384,8 +390,6 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     if isinstance(pressing, np.ndarray):
         for name in ("fx1", "fx2"):
             channels[name] = np.where(np.isfinite(pressing), channels[name], np.nan)
-    sds = [each.width_sd for each in grips]
-    touch_sd = float(np.sqrt(np.mean(np.square(sds)))) if sds else 0.0
     touches = tuple(touch for each in grips for touch in _touches(t, opening, each))
     surely = np.ones(t.size)
     for each in grips:
@@ -397,7 +401,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(fy), t)), _around(t, pose))
     late = np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)) / np.maximum(pace, tool.noise / step)
     timing = np.minimum(late, pose.window / 2)
-    touch_sd = float(np.hypot(touch_sd, trial.touch_sd))
+    touch_sd = float(np.hypot(width_error(grips), trial.touch_sd))
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
                    free=surely, notes=(*_notes(trial, rig, tool), *strays),
                    hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip

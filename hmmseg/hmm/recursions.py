@@ -155,8 +155,7 @@ def shares(before: Array, w: Array) -> Array:
     `before` (..., num_states): weights of all paths one sample earlier; `w` (..., num_bands, num_states).
     """
     ways = jnp.stack([forwards(before, d) + w[..., d, :] for d in range(w.shape[-2])], -2)
-    weights = jnp.exp(ways - finite(ways.max(-2, keepdims=True)))
-    return weights / jnp.maximum(weights.sum(-2, keepdims=True), 1.0)  # the largest is one, or all are zeros
+    return probabilities(ways, -2)
 
 
 def smooth(before: Array, w: Array, final: Array, n: Array, parallel: bool | None) -> tuple[Array, Array]:

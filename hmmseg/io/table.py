@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,7 @@ import numpy as np
 from hmmseg.errors import InputError
 
 MAX_ROWS = 200_000_000  # numerics: more is a damaged or hostile file: 13 columns of it would be 20 GB
+DATE = re.compile(r"\d{4}(?=.{4}).*-.*-")  # how a column of dates begins
 MAX_COLUMNS = 20_000  # limit: no robot records so many; the arrays of each take kilobytes
 
 
@@ -146,7 +148,7 @@ def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
         return column.astype("timedelta64[ns]").astype(np.float64) * 1e-9, None
     if column.dtype.kind == "M":
         stamps = column.astype("datetime64[ns]")
-    elif column.dtype.kind in "OU" and any(_is_date(entry) for entry in column[:1000]):
+    elif column.dtype.kind in "OU" and any(DATE.match(str(entry)) for entry in column[:1000]):
         import pandas as pd
 
         texts = pd.Series(column)
@@ -164,10 +166,6 @@ def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
     first = stamps[present[0]]
     seconds = (stamps - first).astype("timedelta64[ns]").astype(np.float64) * 1e-9
     return np.where(np.isnat(stamps), np.nan, seconds), int(first.astype(np.int64))
-
-
-def _is_date(entry: object) -> bool:
-    return isinstance(entry, str) and len(entry) >= 8 and entry[:4].isdigit() and entry.count("-") >= 2
 
 
 def shown(value: object) -> str:

@@ -18,10 +18,10 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.hand.grips import LEAST_CLOSING, REST, Closings, Grip, grip_of, least_swing
 from hmmseg.hand.tool import WINDOW, Pose, Tool, applied_force, free_motion, pose_of, tool_of
-from hmmseg.hand.wrist import as_fingers, bears, grip_force_of, other_sign
+from hmmseg.hand.wrist import as_fingers, bears, grip_force_of, opening_of, other_sign, width_error
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial
-from hmmseg.robust import bridged, white_sd
+from hmmseg.robust import white_sd
 
 WHERE = "stream"
 BATCH = 0.02  # numerics: s of rows converted at once
@@ -57,8 +57,7 @@ class Wrist:
     @property
     def touch_sd(self) -> float:
         """Uncertainty of the openings at which pads touch [m]."""
-        sds = [each.grip.width_sd for each in self._opening.grips]
-        return float(np.sqrt(np.mean(np.square(sds)))) if sds else 0.0
+        return width_error([each.grip for each in self._opening.grips])
 
     @property
     def newest(self) -> float:
@@ -132,17 +131,14 @@ class Wrist:
         self._window = pose.window
         return pose
 
-    def _opened(self, trial: Trial) -> np.ndarray:
-        """Opening (num_timesteps,) [m], gaps bridged."""
-        return np.sum([bridged(trial.channels[name], trial.t) for name in self.gripper.opening], axis=0)
-
     def _find_tool(self, until: float) -> None:
         """Identify the tool from free motion up to a time [s]; unchanged if there is none."""
         trial = self._trial(-math.inf)
         if not _has_values(trial):
             return
         pose = self._posed(trial)
-        free = np.flatnonzero(self._opening.free(trial.t, self._opened(trial)) & (trial.t <= until))
+        free = self._opening.free(trial.t, opening_of(trial, self.gripper))
+        free = np.flatnonzero(free & (trial.t <= until))
         step = max(1, round(pose.window / APART / float(np.median(np.diff(trial.t)))))
         mask = np.zeros(trial.t.size, bool)
         mask[free[::step]] = True
@@ -173,8 +169,8 @@ class Wrist:
                 near[max(start - 1, 0) : stop + 1] = 1.0
         for each in grips:
             near[each.start + 1 : each.stop - 1] = 2.0
-        fingers = as_fingers(trial, self.rig, pose, tool, self._opened(trial), force.copy(), grips,
-                             grip_force_of(trial.channels, self.gripper))  # fmt: skip
+        opening, pressing = opening_of(trial, self.gripper), grip_force_of(trial.channels, self.gripper)
+        fingers = as_fingers(trial, self.rig, pose, tool, opening, force.copy(), grips, pressing)
         held = self._opening.held
         if held is not None and held.start <= until and not held.judged:
             start, stop = np.searchsorted(trial.t, [held.start, until]).tolist()

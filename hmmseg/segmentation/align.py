@@ -346,7 +346,7 @@ def align(
         The aligned trials; `task` has its number of rounds (over recordings of an unknown number, the most).
     """
     if signals is None:
-        signals = [timely(task_space(trial, rig), trial, rig) for trial in trials]
+        signals = [timely(task_space(trial, rig), trial) for trial in trials]
     whole = [with_heights(s, trial, rig) for s, trial in zip(signals, trials, strict=True)]
     rounds = aligned_rounds(signals, [features(thin(s), rig) for s in whole], task, rig, all_fit)
     aligned = []

@@ -26,6 +26,7 @@ from scipy.special import ndtr, ndtri
 from hmmseg.tables import Brief
 
 POINTS = 41  # numerics: nodes per sample interval
+NODES = (np.arange(POINTS) + 0.5) / POINTS  # numerics: the nodes, as shares of the interval
 BEND = 0.015  # prior: bend that the cubic misses, as a share of interval x change of velocity
 UNSEEN = 0.15  # prior: the same, as a share of the displacement that both velocities do not explain
 LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
@@ -84,7 +85,6 @@ def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
     The fingers move as one, so duration and start of the motion are marginalised jointly. Distance, noise and
     stopping are each finger's own.
     """
-    u = (np.arange(POINTS) + 0.5) / POINTS
     duration = np.geomspace(*MOTION, MOTIONS)[:, None, None]
     starts = (np.arange(STARTS) + 0.5) / STARTS
     age = starts[:, None] * (duration + h) - h  # since its start, at the first sample; uniform
@@ -92,7 +92,7 @@ def last_impact(impacts: list[Crossing], h: float) -> np.ndarray:
     log_prior = log_prior - np.logaddexp.reduce(log_prior, axis=None)
     together, every = log_prior, np.ones(1)
     for c in impacts:
-        log_density = _log_impact(c, h, u, duration, age / duration)
+        log_density = _log_impact(c, h, NODES, duration, age / duration)
         peak = log_density.max(axis=-1, keepdims=True)
         density = np.exp(log_density - peak)
         total = density.sum(axis=-1)
@@ -215,41 +215,39 @@ class BoundaryPosterior(Brief):
 
 def normal(mean: float, sd: float) -> BoundaryPosterior:
     """A boundary at a normally distributed time [s]."""
-    shares = (np.arange(POINTS) + 0.5) / POINTS
-    return BoundaryPosterior(mean + sd * ndtri(shares), np.full(POINTS, 1 / POINTS))
+    return BoundaryPosterior(mean + sd * ndtri(NODES), np.full(POINTS, 1 / POINTS))
 
 
-def crossing_density(crossings: list[Crossing], width: float) -> np.ndarray:
+def crossing_density(crossings: list[Crossing], width: float, first: bool = False) -> np.ndarray:
     """Density (POINTS,), summing to 1, of the time in an interval of `width` s at which all have crossed.
 
-    With several crossings (two fingers that touch) the boundary is the last of them; without any the density
-    is uniform.
+    With several crossings (two fingers that touch) the boundary is the last of them, or if stated the
+    `first`; without any the density is uniform.
     """
     if not crossings:
         return np.full(POINTS, 1.0 / POINTS)
-    if all(c.kind == "impact" for c in crossings):
+    if first:
+        crossed = 1 - np.prod([1 - _crossed(c, width) for c in crossings], axis=0)
+    elif all(c.kind == "impact" for c in crossings):
         crossed = last_impact(crossings, width)
     else:
         crossed = np.prod([_crossed(c, width) for c in crossings], axis=0)
-    last = np.diff(crossed, prepend=0.0)
-    return (1 - UNIFORM) * last / last.sum() + UNIFORM * (1.0 / POINTS)
+    density = np.diff(crossed, prepend=0.0)
+    return (1 - UNIFORM) * density / density.sum() + UNIFORM / POINTS
 
 
 def _crossed(c: Crossing, h: float) -> np.ndarray:
     """Probability (POINTS,) that one crossing has occurred by each node of an interval of h s."""
     if c.kind == "impact":
         return last_impact([c], h)
-    log_density = (log_smooth if c.kind == "smooth" else log_launch)(c, h, (np.arange(POINTS) + 0.5) / POINTS)
+    log_density = (log_smooth if c.kind == "smooth" else log_launch)(c, h, NODES)
     density = np.exp(log_density - log_density.max())
     return np.cumsum(density / density.sum())
 
 
 def first_of(crossings: list[Crossing], width: float) -> np.ndarray:
     """Density (POINTS,) of the time of the first crossing."""
-    if not crossings:
-        return crossing_density([], width)
-    first = -np.diff(np.prod([1 - _crossed(c, width) for c in crossings], axis=0), prepend=1.0)
-    return (1 - UNIFORM) * first / first.sum() + UNIFORM / POINTS
+    return crossing_density(crossings, width, first=True)
 
 
 def evenly(t: np.ndarray, interval_probability: np.ndarray) -> BoundaryPosterior:
@@ -257,9 +255,8 @@ def evenly(t: np.ndarray, interval_probability: np.ndarray) -> BoundaryPosterior
 
     Intervals of probability below 1e-6 are omitted.
     """
-    u = (np.arange(POINTS) + 0.5) / POINTS
     likely = np.flatnonzero(interval_probability > 1e-6)
-    times = t[likely, None] + u * (t[likely + 1] - t[likely])[:, None]
+    times = t[likely, None] + NODES * (t[likely + 1] - t[likely])[:, None]
     masses = np.repeat(interval_probability[likely], POINTS)
     return blurred(times.ravel(), masses, t[0], t[-1])
 

@@ -26,10 +26,11 @@ from functools import cached_property
 import numpy as np
 from scipy.special import log_ndtr
 
-from hmmseg.levels import SURE, TAIL
+from hmmseg.densities import log_student
+from hmmseg.levels import SURE
 from hmmseg.segmentation.boundaries import (
+    NODES,
     ONSET,
-    POINTS,
     BoundaryPosterior,
     Crossing,
     Kind,
@@ -77,13 +78,13 @@ def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
     log_force = np.log(2 * max(np.ptp(pressed), 10 * c.sd_pressed)) * force
     log_place = np.log(2 * max(np.ptp(place), 10 * c.sd_place)) * position
     pushes = np.where(force, log_ndtr(pressed / c.sd_pressed), 0.0) - log_force
-    silent = np.where(force, _log_student(pressed / c.sd_apart) - np.log(c.sd_apart), 0.0)
+    silent = np.where(force, log_student(pressed, c.sd_apart), 0.0)
     within = np.where(position, log_ndtr(place / c.sd_place), 0.0) - log_place
     beyond = np.where(position, log_ndtr(-place / c.sd_place), 0.0) - log_place
     sd_force = np.hypot(c.sd_pressed, c.form * np.abs(pressed))
     both = np.hypot(sd_force, c.sd_place)
     depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
-    agree = _log_student((pressed - place) / both) - np.log(both) - log_place
+    agree = log_student(pressed - place, both) - log_place
     # Both hypotheses share a density of places. A place whose noise hides the whole motion of a contact must
     # not count against a contact that the force shows.
     deep = max(float(np.quantile(pressed, DEEP)), ROOT_2PI * c.sd_pressed)
@@ -106,11 +107,6 @@ def switch_probability(c: Penetration, log_prior: np.ndarray, making: bool) -> n
     log_weight = np.cumsum(before)[:-1] + np.cumsum(after[::-1])[::-1][1:] + log_prior
     weight = np.exp(log_weight - log_weight.max())
     return weight / weight.sum()
-
-
-def _log_student(z: np.ndarray) -> np.ndarray:
-    """Log density of a standard Student-t variable (the constant is for TAIL degrees of freedom)."""
-    return -0.98082925 - (TAIL + 1) / 2 * np.log1p(z**2 / TAIL)
 
 
 LIKELY = 1e-3  # numerics: least probability of an interval within which the crossing is resolved
@@ -258,7 +254,6 @@ def _seen(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, 
     t, making = contacts[0].t, change.making
     switches = np.array([switch_probability(c, change.log_prior, making) for c in contacts])
     combined = crossing_density if making else first_of
-    inner = (np.arange(POINTS) + 0.5) / POINTS
     times, masses = [], []
     for n in range(t.size - 1):
         width = float(t[n + 1] - t[n])
@@ -269,7 +264,7 @@ def _seen(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, 
             density = combined(deciding if all(x.known for x in deciding) else [], width)
             if not np.isfinite(density).all():
                 density = combined([], width)
-            times.append(t[n] + inner * width)
+            times.append(t[n] + NODES * width)
             masses.append(mass * density)
     return np.concatenate(times), np.concatenate(masses)
 

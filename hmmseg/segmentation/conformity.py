@@ -396,10 +396,9 @@ class Plan:
 
 
 def plan(c: Conformity, steps: tuple[Subtask, ...]) -> Plan:
-    """Order shown by a misfit."""
+    """Order shown by a misfit, a trial that fails at some subtask."""
     failing = c.failing
-    if failing is None:
-        raise ValueError("the trial fits its task")
+    assert failing is not None
     unseen = next((i for i, r in enumerate(c.runs) if r.state != FREE and r.block is None), len(c.runs))
     runs = list(c.runs[: max(unseen, 1)])  # of a block that no grip shows nothing is known
     if c.wrong_rise is not None:  # wrong block or place: nothing from there on belongs to the task
@@ -461,8 +460,7 @@ def explain(c: Conformity, steps: tuple[Subtask, ...], starts: Sequence[float]) 
 
     `starts` [s]: start of each step of the order shown.
     """
-    if c.failing is None:
-        raise ValueError("the trial fits its task")
+    assert c.failing is not None
     expected = steps[c.failing]
     if c.wrong_rise is not None:
         moved = "raised" if c.wrong_rise > 0 else "lowered"

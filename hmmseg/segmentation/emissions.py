@@ -32,7 +32,7 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
-from hmmseg.robust import median_of_known, white_sd
+from hmmseg.robust import extent, median_of_known, white_sd
 from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
@@ -231,8 +231,7 @@ def log_likelihoods(
 
 def _broad(f: Features, *names: str) -> np.ndarray:
     """Log density (num_timesteps,) of unconstrained quantities; 0 where missing."""
-    parts = [-np.log(f.span[name]) * np.isfinite(getattr(f, name)) for name in names]
-    return parts[0] if len(parts) == 1 else parts[0] + parts[1]
+    return np.sum([-np.log(f.span[name]) * np.isfinite(getattr(f, name)) for name in names], axis=0)
 
 
 def _log_width(f: Features, p: Parameters, name: str) -> np.ndarray:
@@ -328,10 +327,10 @@ def features(signals: Signals, rig: Rig) -> Features:
 
     force = np.stack([s.fx1, s.fy1, s.fx2, s.fy2], axis=1)
     span = {
-        "vx": _range(s.vx, 1e-3),
-        "vy": _range(s.vy, 1e-3),
-        "y": _range(s.y, 1e-4),
-        "d": _range(s.distance, 1e-4),
+        "vx": max(extent(s.vx), 1e-3),
+        "vy": max(extent(s.vy), 1e-3),
+        "y": max(extent(s.y), 1e-4),
+        "d": max(extent(s.distance), 1e-4),
         "force": 1.5 * float(np.nanmax(np.abs(force))) + 1e-3,
         "press": 1.5 * float(np.max(np.abs(s.fy), initial=0.0, where=np.isfinite(s.fy))) + 1e-3,
     }
@@ -352,8 +351,3 @@ def without(f: Features, spans: Sequence[tuple[float, float]]) -> Features:
         return f
     channels = {name: np.where(blanked, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")}
     return replace(f, force=np.where(blanked[:, None], np.nan, f.force), **channels)
-
-
-def _range(values: np.ndarray, least: float) -> float:
-    finite = values[np.isfinite(values)]  # empty if some joint is always missing
-    return max(float(np.ptp(finite)), least) if finite.size else least

@@ -19,7 +19,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.contact.equations import block_width
 from hmmseg.hmm import dense
 from hmmseg.levels import FIRM, MOVED, SURE
-from hmmseg.robust import NORMAL, median_of_known, runs
+from hmmseg.robust import NORMAL, filled, median_of_known, runs
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
@@ -70,12 +70,6 @@ def ungripped(f: Features) -> tuple[np.ndarray, float, np.ndarray]:
     bias = np.array([median_of_known(c, 0.0) for c in free.T])
     spread = np.array([NORMAL * median_of_known(np.abs(c), np.nan) for c in (free - bias).T])
     return bias, max(median_of_known(spread, 0.0), noise), held
-
-
-def filled(values: np.ndarray) -> np.ndarray:
-    """Values with gaps interpolated; zeros if all are missing."""
-    there = np.flatnonzero(np.isfinite(values))
-    return np.interp(np.arange(values.size), there, values[there]) if there.size else np.zeros(values.size)
 
 
 def blocks_of(f: Features, bias: np.ndarray, held: np.ndarray, guessing: bool = False) -> tuple[Block, ...]:

@@ -35,7 +35,7 @@ class OnDisk:
 
     def __init__(self, recording: LongRecording, rig: Rig) -> None:
         self.recording, self.rig = recording, rig
-        self._late = come_late(recording.beginning(), rig)
+        self._late = come_late(recording.beginning())
 
     @property
     def t(self) -> np.ndarray:

@@ -275,15 +275,15 @@ def naming(
     change = np.logaddexp(np.log1p(-weighing.unseen) + course.seen, np.log(weighing.unseen))
     groups = evidence + weighing.shares * np.log(shares).mean(0)
     end = evidence + evidence[:, -1] + weighing.settled + np.r_[0.0, change, 0.0]
-    tail = np.logaddexp(evidence[:, -1], _sum(end, 1))
+    tail = np.logaddexp(evidence[:, -1], np.logaddexp.reduce(end, axis=1))
     at = label_weights(course, labels, weighing)
     at[:, 1:-1] += change
     ahead = [groups[0] + at[0]]
     for b in range(1, num_states - 1):
-        ahead.append(_sum(ahead[-1][:, None] + groups, 0) + at[b])
+        ahead.append(np.logaddexp.reduce(ahead[-1][:, None] + groups) + at[b])
     behind = [tail]
     for b in range(num_states - 2, 0, -1):
-        behind.append(_sum(groups + (behind[-1] + at[b])[None], 1))
+        behind.append(np.logaddexp.reduce(groups + (behind[-1] + at[b])[None], axis=1))
     number = len(tail) - 1
     joint = np.array([one + other for one, other in zip(ahead, behind[::-1], strict=True)])[:, 1:number]
     total = float(np.logaddexp.reduce(joint[0]))
@@ -340,7 +340,3 @@ def _increasing(right: np.ndarray) -> tuple[float, list[int]]:
     for back in reversed(source):
         cuts.append(back[cuts[-1]])
     return float(total.max()), cuts[::-1]
-
-
-def _sum(log_weights: np.ndarray, axis: int) -> np.ndarray:
-    return np.logaddexp.reduce(log_weights, axis=axis)

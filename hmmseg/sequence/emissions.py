@@ -19,13 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import gammaln
 
+from hmmseg.densities import log_student
 from hmmseg.hmm import Chain, left_to_right
 from hmmseg.hmm.inference import align
 from hmmseg.hmm.results import AlignmentPosterior
+from hmmseg.levels import TAIL
 
-DOF = 4.0  # cited: degrees of freedom, Lange, Little and Taylor 1989; limits the weight of transients
 ONE_CELL = 1e-9  # numerics: weight [cells] below which a state is not updated
 FLOORS = (1.0, 0.5, 0.25, 0.12, 0.06)  # numerics: least scale of an emission, lowered as EM converges
 STEPS_PER_FLOOR = 4  # numerics: EM steps at each floor
@@ -42,10 +42,7 @@ class StudentEmissions:
 
     def log_likelihoods(self, values: np.ndarray) -> np.ndarray:
         """Tempered log-likelihoods (num_cells, num_states); missing features contribute nothing."""
-        z2 = ((values[:, None] - self.loc) / self.scale) ** 2
-        constant = gammaln((DOF + 1) / 2) - gammaln(DOF / 2) - np.log(np.pi * DOF) / 2
-        log_density = constant - np.log(self.scale) - (DOF + 1) / 2 * np.log1p(z2 / DOF)
-        return self.temper * np.nansum(log_density, axis=2)
+        return self.temper * log_student(values[:, None] - self.loc, self.scale).sum(axis=2)
 
 
 def update(emissions: StudentEmissions, values: np.ndarray, weights: np.ndarray,
@@ -60,7 +57,7 @@ def update(emissions: StudentEmissions, values: np.ndarray, weights: np.ndarray,
     x = np.where(known, values, 0.0)
     for k in range(len(loc)):
         gamma = weights[:, k, None] * known
-        u = gamma * (DOF + 1) / (DOF + ((x - loc[k]) / scale[k]) ** 2)
+        u = gamma * (TAIL + 1) / (TAIL + ((x - loc[k]) / scale[k]) ** 2)
         enough = (total := gamma.sum(0)) > ONE_CELL
         loc[k, enough] = ((u * x).sum(0)[enough]) / u.sum(0)[enough]
         spread = (u * (x - loc[k]) ** 2).sum(0)[enough] / total[enough]
@@ -139,16 +136,11 @@ class Detectors:
     def log_ratios(self, values: np.ndarray) -> np.ndarray:
         """Log-likelihood ratios (num_cells - 1, num_boundaries), before weighting, at each cell edge."""
         windows = _windows(values, self.half)
-        log_far = _log_density(windows, self.usual)
+        log_far = log_student(windows, self.usual)
         return np.stack([
-            np.nansum(_log_density(windows - mean, spread) - log_far, axis=(1, 2))
+            (log_student(windows - mean, spread) - log_far).sum(axis=(1, 2))
             for mean, spread in zip(self.mean, self.spread, strict=True)
         ], axis=1)  # fmt: skip
-
-
-def _log_density(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Log density of a Student t, without its constant."""
-    return -(DOF + 1) / 2 * np.log1p((x / scale) ** 2 / DOF) - np.log(scale)
 
 
 def _windows(values: np.ndarray, half: int) -> np.ndarray:

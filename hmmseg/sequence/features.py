@@ -13,7 +13,7 @@ import numpy as np
 
 from hmmseg.errors import InputError
 from hmmseg.io.trial import Trial
-from hmmseg.robust import bridged
+from hmmseg.robust import filled
 
 CELLS_PER_TRIAL = 1500  # numerics: resolves a boundary to under 0.1 % of a trial's duration
 FEWEST = 20  # numerics: changes of a channel below which its own sampling rate is not inferred
@@ -88,8 +88,7 @@ def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.n
 
 def fill_gaps(x: np.ndarray) -> np.ndarray:
     """Missing cells interpolated linearly (held at the ends) in each column, 0 in an empty one."""
-    columns = [bridged(c) if np.isfinite(c).any() else np.zeros_like(c) for c in x.T]
-    return np.stack(columns, axis=1)
+    return np.stack([filled(column) for column in x.T], axis=1)
 
 
 def edge_preserving_slopes(x: np.ndarray, window: int) -> np.ndarray:

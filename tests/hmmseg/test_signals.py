@@ -192,7 +192,7 @@ def _with_differences(trial: Trial, over: int) -> Trial:
 def test_velocities_that_repeat_the_positions_are_replaced_by_central_differences(over):
     trial, rig = _trial()
     late = _with_differences(trial, over)
-    found = timely(task_space(late, rig), late, rig)
+    found = timely(task_space(late, rig), late)
     assert found.derived
     truth, raw = task_space(trial, rig), task_space(late, rig)
     moving = slice(5, -5)
@@ -203,7 +203,7 @@ def test_velocities_that_repeat_the_positions_are_replaced_by_central_difference
 def test_velocities_of_their_own_stay():
     trial, rig = _trial()
     signals = task_space(trial, rig)
-    assert timely(signals, trial, rig) is signals
+    assert timely(signals, trial) is signals
     still = np.zeros(50)  # positions that never change prove nothing
     assert not late_differences(np.arange(50) * 0.05, still, still)
 
