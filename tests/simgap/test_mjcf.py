@@ -360,6 +360,39 @@ def test_joints_without_a_column_follow_their_equality(files, seen):
     assert not found.warnings
 
 
+TIED = """<mujoco>
+  <option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="left" type="slide" axis="1 0 0" armature="0.1"/>
+      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
+    <body pos="1 0 0"><joint name="right" type="slide" damping="20" axis="1 0 0"/>
+      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
+  </worldbody>
+  <equality><joint joint1="right" joint2="left"/></equality>
+  <actuator><position name="servo" joint="left" kp="200" kv="10"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files):
+    """The second of two tied fingers lags by what its damping stretches the tie, in plain MuJoCo."""
+    columns = '[columns.w]\njoint = "left"\n[columns.u]\nactuator = "servo"\nunit = "m"\n'
+    found, model = load_mjcf(*files(TIED, columns)), mujoco.MjModel.from_xml_string(TIED)
+    data, t, run = mujoco.MjData(model), np.arange(0, 1, 0.01), []
+    u = 0.05 * np.sin(6 * t)
+    for goal in u:
+        run.append((*data.qpos, *data.qvel))
+        data.ctrl[:] = goal
+        mujoco.mj_step(model, data, nstep=5)
+    log = Recording("a.csv", t, {"w": np.array(run)[:, 0], "u": u})
+    found.effects([log])
+    left, right, rate, other = run[60]
+    job = Job({}, log.window(60, 90), {"w": left, "w_rate": rate})
+    _, *state = found.simulator._states([job])[0]
+    assert abs(left - right) > 1e-4
+    np.testing.assert_allclose(state, [left, right, rate, other], atol=0.02 * abs(left - right))
+
+
 def test_joints_that_nothing_shows_are_said(files):
     found = load_mjcf(*files(FINGERS, '[columns.w]\njoint = "tip"\n'))
     assert "no column shows left, right, which the model moves as it runs freely" in found.warnings[0]
