@@ -78,7 +78,8 @@ def patched(model: Path, composed: Composed, point: Point, changed: Sequence[str
         says |= dict.fromkeys(effect.model.values(), effect.says)
         lacking += [] if effect.model else [f"{name}: {effect.says}"]
     for name, setting in simulator.settings.items():  # in the order in which runs set them
-        if name in says and not setting.stored:
+        motor = name.startswith("actuator:") and not compiled.nu  # that only its map gives the model
+        if name in says and (motor or not setting.stored):
             lacking.append(f"{name}: {says[name]}")
         elif name in says:
             finest = -float("inf") if setting.mixed is None else setting.mixed

@@ -1,5 +1,7 @@
 """MuJoCo models as simulators: maps, rollouts against closed forms, what is set and taken back, patches."""
 
+import tomllib
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from simgap.robots.rows import noises  # noqa: E402
 from simgap.simulators.mjcf.engine import rollout, warned  # noqa: E402
 from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
 from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
+from simgap.simulators.mjcf.map import proposed_map  # noqa: E402
 from simgap.simulators.mjcf.runs import (  # noqa: E402
     Held,
     _carried_out,
@@ -358,6 +361,99 @@ def test_joints_without_a_column_follow_their_equality(files, seen):
     _, *state = found.simulator._states([job])[0]
     np.testing.assert_allclose(state, [left, right, 3 * right**2, 0.1, 0.2, 6 * right * 0.2])
     assert not found.warnings
+
+
+TIED = """<mujoco>
+  <option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="left" type="slide" axis="1 0 0" armature="0.1"/>
+      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
+    <body pos="1 0 0"><joint name="right" type="slide" damping="20" axis="1 0 0"/>
+      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
+  </worldbody>
+  <equality><joint joint1="right" joint2="left"/></equality>
+  <actuator><position name="servo" joint="left" kp="200" kv="10"/></actuator>
+</mujoco>
+"""
+
+
+def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files):
+    """The second of two tied fingers lags by what its damping stretches the tie, in plain MuJoCo."""
+    columns = '[columns.w]\njoint = "left"\n[columns.u]\nactuator = "servo"\nunit = "m"\n'
+    found, model = load_mjcf(*files(TIED, columns)), mujoco.MjModel.from_xml_string(TIED)
+    data, t, run = mujoco.MjData(model), np.arange(0, 1, 0.01), []
+    u = 0.05 * np.sin(6 * t)
+    for goal in u:
+        run.append((*data.qpos, *data.qvel))
+        data.ctrl[:] = goal
+        mujoco.mj_step(model, data, nstep=5)
+    log = Recording("a.csv", t, {"w": np.array(run)[:, 0], "u": u})
+    found.effects([log])
+    left, right, rate, other = run[60]
+    job = Job({}, log.window(60, 90), {"w": left, "w_rate": rate})
+    _, *state = found.simulator._states([job])[0]
+    assert abs(left - right) > 1e-4
+    np.testing.assert_allclose(state, [left, right, rate, other], atol=0.02 * abs(left - right))
+
+
+URDF = """<robot name="swing">
+  <link name="base"/>
+  <link name="bob"><inertial><origin xyz="0 0 -0.2"/><mass value="0.5"/>
+    <inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial></link>
+  <joint name="pivot" type="continuous"><parent link="base"/><child link="bob"/><axis xyz="0 1 0"/></joint>
+</robot>
+"""
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    def write(described: str = MAP.replace('"m"', '"pivot"')):
+        (tmp_path / "swing.urdf").write_text(URDF)
+        (tmp_path / "map.toml").write_text(described)
+        return tmp_path / "swing.urdf", tmp_path / "map.toml"
+
+    return write
+
+
+def test_a_column_of_torques_drives_a_urdf(urdf):
+    found, t = load_mjcf(*urdf()), np.arange(0, 1, 0.01)
+    log = Recording("a.csv", t, {"q": np.zeros(t.size), "u": 0.3 * np.sin(5 * t)})
+    more = found.effects([log])
+    values, asked = {n: p.nominal for n, p in found.simulator.parameters.items()}, []
+    model = mujoco.MjModel.from_xml_string(URDF)
+    data = mujoco.MjData(model)
+    for torque in log["u"]:
+        asked.append(float(data.qpos[0]))
+        data.qfrc_applied[:] = torque
+        mujoco.mj_step(model, data, nstep=5)
+    got = found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 0.0})["q"]
+    np.testing.assert_allclose(got, asked, atol=1e-6)
+    effects = effects_of(found.simulator, [log], more)
+    composed, gain = Composed.of(found.simulator, [log], effects, {"q": 1e-4}), "actuator:pivot.gain"
+    text, lacking = patched(urdf()[0], composed, {gain: {"gain": 0.1}}, [gain])
+    assert "<mujoco" in text and len(lacking) == 1 and lacking[0].startswith(gain)
+
+
+def test_what_a_urdf_cannot_be_asked_is_said(urdf, tmp_path):
+    angle = MAP.partition("[columns.u]")[0]
+    for column, line in (
+        ('actuator = "pivot"\nunit = "rad"', "no servo to be commanded.*<position joint=.pivot"),
+        ('actuator = "pivot"', "no servo to be commanded"),
+        ('actuator = "pivott"\nunit = "Nm"', "no joint pivott.*did you mean pivot"),
+        ('actuator = "pivot"\nkind = "force"', "no actuator to give a force.*unit = .Nm"),
+        ('joint = "pivot"\nkind = "torque"', "no actuator to give a torque.*unit = .Nm"),
+    ):
+        with pytest.raises(InputError, match=rf"columns\.u: .*{line}"):
+            load_mjcf(*urdf(f"{angle}[columns.u]\n{column}\n"))
+    assert "no column drives the model" in load_mjcf(*urdf(angle)).warnings[0]
+
+
+def test_a_map_of_a_urdf_has_torques_drive_it_and_leaves_goals_to_its_user(urdf):
+    columns = [("pivot_pos", None), ("pivot_effort", None), ("pivot_cmd", None)]
+    text, left = proposed_map(urdf()[0], columns, {})
+    described = tomllib.loads(text)["columns"]
+    assert described == {"pivot_pos": {"joint": "pivot"}, "pivot_effort": {"actuator": "pivot", "unit": "Nm"}}
+    assert left == ["pivot_cmd"]
 
 
 def test_joints_that_nothing_shows_are_said(files):

@@ -94,9 +94,12 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     described = read_map(map_file)
     try:
         spec = mujoco.MjSpec.from_file(str(xml))
-        plain = spec.compile()
+        spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {str(error).splitlines()[0]}") from None
+    if not spec.actuators:
+        _add_motors(spec, described.columns, str(map_file))
+    plain = spec.compile()
     if not SHORTEST <= plain.opt.timestep <= 1.0:
         raise InputError(f"--mjcf {xml}: option timestep", f"found {plain.opt.timestep:g} s",
                          f"from {SHORTEST:g} to 1 s")  # fmt: skip
@@ -125,10 +128,32 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     model = compiled(spec)
     simulator, warnings = _simulator(model, described, str(map_file), address)
     simulator.spec = spec
+    if xml.suffix.lower() == ".urdf" and not model.nu:
+        warnings.append(f"{map_file}: no column drives the model, which moves freely: a URDF has no actuator")
     whole = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, whole)
     digest = hashlib.sha256(f"{mujoco.__version__} {described}".encode() + whole.tobytes()).digest()
     return Loaded(simulator, described, candidates, tuple(warnings), digest)
+
+
+def _add_motors(spec: Any, columns: Mapping[str, Mapped], file: str) -> None:
+    """Add to a model without actuators, such as a URDF, a motor for every joint whose torque a column
+    commands, under the joint's name."""
+    for column, m in columns.items():
+        if m.thing == "sensor" or m.kind not in ("command", "force", "torque"):
+            continue
+        where, motor = f"{file}: columns.{column}", f'actuator = "{m.name}" and unit = "Nm" or "N"'
+        if m.kind != "command":
+            raise InputError(where, f"the model has no actuator to give a {m.kind}", motor)
+        if spec.joint(m.name) is None:
+            known = [joint.name for joint in spec.joints]
+            raise InputError(
+                where, f"the model has no actuator, and no joint {m.name}", nearest(m.name, known)
+            )
+        if UNITS.get(known_unit(str(m.unit)) or "", ("",))[0] not in ("torque", "force"):
+            servo = f'an MJCF with <position joint="{m.name}" kp=".." kv=".."/>, or a torque: {motor}'
+            raise InputError(where, "the model has no servo to be commanded", servo)
+        spec.add_actuator(name=m.name, target=m.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
 
 
 # By thing and kind: MuJoCo's sensor, and the SI units if it rotates and if it slides.

@@ -173,12 +173,14 @@ def proposed_map(
     try:
         model = mujoco.MjModel.from_xml_path(str(xml))
     except (ValueError, OSError) as error:
-        raise InputError(str(xml), f"cannot be read: {error}", "a MuJoCo model") from None
+        raise InputError(str(xml), f"cannot be read: {error}", "an MJCF or URDF file") from None
     known = {kind: {n: n for n in names_of(model, kind)} for kind in ("actuator", "joint", "sensor")}
     for name in known["actuator"].copy():
         actuator = model.actuator(name)
         if actuator.trntype[0] == mujoco.mjtTrn.mjTRN_JOINT:
             known["actuator"].setdefault(model.joint(actuator.trnid[0]).name, name)
+    if bare := not model.nu:  # such as a URDF: a motor for every joint's torque
+        known["actuator"] = known["joint"]
     time = clock.get("from", "t")
     lines, left = [f"# Which column is which part of {xml.name}; SI where no unit is given."], []
     if clock:
@@ -192,13 +194,16 @@ def proposed_map(
         order = ("actuator", "joint", "sensor") if driven else ("joint", "sensor", "actuator")
         longest = ((kind, n) for kind in order for n in sorted(known[kind], key=len, reverse=True))
         part = next(((kind, known[kind][n]) for kind, n in longest if n and n.lower() in name.lower()), None)
-        if part is None:
+        if part is None or (bare and driven and not said & EFFORTS):
             left.append(name)
             joints = ", ".join(known["joint"])
             lines += [f"# [columns.{json.dumps(name)}]", f'# joint = "..."  # one of {joints}']
             continue
         lines += [f"[columns.{json.dumps(name)}]", f"{part[0]} = {json.dumps(part[1])}"]
         lines += ['kind = "velocity"'] if part[0] == "joint" and said & SPEEDS else []
-        lines += ['kind = "force"'] if part[0] == "actuator" and not said & COMMANDS and driven else []
+        gave = part[0] == "actuator" and not said & COMMANDS and driven
+        lines += ['kind = "force"'] if gave and not bare else []
+        if gave and bare and unit is None:
+            unit = "N" if model.joint(part[1]).type[0] == mujoco.mjtJoint.mjJNT_SLIDE else "Nm"
         lines += [f"unit = {json.dumps(unit)}"] if unit else []
     return "\n".join(lines) + "\n", left

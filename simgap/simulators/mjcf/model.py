@@ -112,7 +112,10 @@ class MjcfSimulator:
         for column, (q, v) in self._places.items():
             state[1 + q] = job.start[column]
             state[1 + nq + v] = job.start[column + RATE]
-        self._tie(state)
+        state = self._tied(state)
+        if job.recording.name in self._runs:  # under load a tie gives, as in the model's own run
+            ran = self._runs[job.recording.name][job.recording.first]
+            state += ran - self._tied(ran)
         for joint, columns in self.free.items():
             q, v = 1 + int(self.model.jnt_qposadr[joint]), 1 + nq + int(self.model.jnt_dofadr[joint])
             place, turn = [columns[a] for a in POSE[:3]], [columns[a] for a in POSE[3:]]
@@ -126,13 +129,15 @@ class MjcfSimulator:
             state[v + 3 : v + 6] = body_rate(quat, rate - quat * (quat @ rate))
         return state
 
-    def _tie(self, state: np.ndarray) -> None:
-        """Put joints that follow others where these have them, in a full physics state, in place."""
+    def _tied(self, state: np.ndarray) -> np.ndarray:
+        """A full physics state with joints that follow others where these have them."""
+        state = state.copy()
         m, q, v = self.model, state[1:], state[1 + self.model.nq :]
         for joint, other, by in self._ties:
             at, away = m.jnt_qposadr[joint], q[m.jnt_qposadr[other]] - m.qpos0[m.jnt_qposadr[other]]
             q[at] = m.qpos0[at] + by(away)
             v[m.jnt_dofadr[joint]] = by.deriv()(away) * v[m.jnt_dofadr[other]]
+        return state
 
     def _own_state(self, log: Recording, whole: bool) -> np.ndarray:
         """The model's own start of a log; of a window, what its run of the whole log has reached."""
@@ -142,8 +147,7 @@ class MjcfSimulator:
         for column, (q, _) in self._places.items():
             seen = log[column][np.isfinite(log[column])]
             state[1 + q] = seen[0] if seen.size else 0.0
-        self._tie(state)
-        return state
+        return self._tied(state)
 
     def _reset(self) -> np.ndarray:
         """The model's own state, or its keyframe's."""
@@ -179,7 +183,7 @@ class MjcfSimulator:
 
     def prepare(self, recordings: Sequence[Recording]) -> None:
         """Run whole logs once to start windows from, where columns do not determine the whole state."""
-        if not self._partial:
+        if not (self._partial or self._ties):
             return
         for log in recordings:
             first = self._state(Job({}, log, None))
