@@ -171,18 +171,6 @@ def test_saved_models_segment_alike(tmp_path):
     assert segment_sequence([trial], TASK, loaded) == segment_sequence([trial], TASK, taught())
 
 
-def broken_models(tmp_path):
-    path = tmp_path / "m.npz"
-    save_model(taught(), path)
-    with np.load(path) as file:
-        table = dict(file)
-
-    def written(**changes):
-        np.savez(path, **{k: v for k, v in {**table, **changes}.items() if v is not None})
-
-    return path, written
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -198,8 +186,11 @@ def broken_models(tmp_path):
     ],
 )
 def test_bad_model_files_are_refused(tmp_path, changes, message):
-    path, written = broken_models(tmp_path)
-    written(**changes)
+    path = tmp_path / "m.npz"
+    save_model(taught(), path)
+    with np.load(path) as file:
+        table = dict(file) | changes
+    np.savez(path, **{k: v for k, v in table.items() if v is not None})
     with pytest.raises(InputError, match=message):
         load_model(path, TASK)
 

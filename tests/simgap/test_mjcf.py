@@ -55,8 +55,6 @@ def loaded(files, *candidates: str):
     found = load_mjcf(*files(), candidates)
     t = np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.1 * np.cos(6.9 * t), "u": np.zeros(t.size)})
-    effects = found.effects([log])
-    return found, log, effects
     return found, log, found.effects([log])
 
 
@@ -75,7 +73,8 @@ def test_a_window_is_the_linear_pendulum(files, share):
     simulator = found.simulator
     nominal = {n: p.nominal for n, p in simulator.parameters.items()}
     window = Recording("a.csv", log.t[7:60], {n: v[7:60] for n, v in log.columns.items()}, 7)
-    simulator.simulate(nominal | {"body:bob.mass": 0.6}, log, {"q": 0.1, "q_rate": 0.0})  # leaves no trace
+    heavy = nominal | {"body:bob.mass": 0.6, "joint:pivot.damping": 0.01}
+    simulator.simulate(heavy, log, {"q": 0.1, "q_rate": 0.0})  # leaves no trace
     nominal["drive.gravity_compensation"] = share
     (channels,) = simulator.simulate_many([Job(nominal, window, {"q": 1e-3, "q_rate": -2e-3})])
     assert channels is not None
@@ -85,19 +84,6 @@ def test_a_window_is_the_linear_pendulum(files, share):
     np.testing.assert_allclose(
         channels["q"], 1e-3 * np.cos(omega * t) - 2e-3 / omega * np.sin(omega * t), atol=2e-8
     )
-
-
-def test_what_is_set_is_taken_back(files):
-    found, log, _ = loaded(files)
-    simulator = found.simulator
-    nominal = {n: p.nominal for n, p in simulator.parameters.items()}
-    start = {"q": 0.1, "q_rate": 0.0}
-    before, heavy, after = (
-        simulator.simulate_many([Job({**nominal, **change}, log, start)])[0]["q"]
-        for change in ({}, {"joint:pivot.damping": 0.01, "body:bob.mass": 0.7}, {})
-    )
-    assert np.abs(before - heavy).max() > 1e-3
-    np.testing.assert_array_equal(before, after)
 
 
 def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
