@@ -263,17 +263,14 @@ LOST, OFF = np.full(APPROACH.size, np.nan), APPROACH[::-1]
 RINGING = np.where(OFF < -2e-4, 1e-4 * np.sin(np.arange(OFF.size)), np.maximum(OFF, 0))
 
 
-@pytest.mark.parametrize(
-    ("making", "others", "reach", "share"),
-    [
-        (True, {}, 0, 0.9),
-        (False, {}, 0, 0.9),
-        (True, {"pressed": LOST}, 1, 0.9),  # a missing sensor adds nothing, and the other decides
-        (True, {"place": LOST}, 1, 0.9),
-        (False, {"pressed": RINGING}, 1, 0.9),  # a ringing force after a release is no contact
-        (True, {"place": APPROACH - 6e-4}, 1, 0.8),  # as it lies later, pushed
-    ],
-)
+@pytest.mark.parametrize(("making", "others", "reach", "share"), [
+    (True, {}, 0, 0.9),
+    (False, {}, 0, 0.9),
+    (True, {"pressed": LOST}, 1, 0.9),  # a missing sensor adds nothing, and the other decides
+    (True, {"place": LOST}, 1, 0.9),
+    (False, {"pressed": RINGING}, 1, 0.9),  # a ringing force after a release is no contact
+    (True, {"place": APPROACH - 6e-4}, 1, 0.8),  # as it lies later, pushed
+])  # fmt: skip
 def test_the_interval_of_the_sign_change_is_found(making, others, reach, share):
     p = APPROACH if making else OFF
     probability = switch_probability(sensed(p, **others), np.zeros(p.size - 1), making)

@@ -351,16 +351,13 @@ def test_a_lerobot_data_set_with_subtasks(tmp_path, version):
         lerobot_files(tmp_path / "new", {})
 
 
-@pytest.mark.parametrize(
-    ("write", "trials", "line"),
-    [
-        ("trial_01.csv", 1, "--write .*: would write over its own recording; expected another place"),
-        ("out.csv", 2, "--write out.csv: is one file for 2 recordings; expected a folder"),
-        (".", 1, "--write .: would write over its own recording"),
-        ("file/out.csv", 1, "--write file: .*file is not a folder"),
-        ("file", 1, "--write file: .*file is not a folder; expected a folder"),
-    ],
-)
+@pytest.mark.parametrize(("write", "trials", "line"), [
+    ("trial_01.csv", 1, "--write .*: would write over its own recording; expected another place"),
+    ("out.csv", 2, "--write out.csv: is one file for 2 recordings; expected a folder"),
+    (".", 1, "--write .: would write over its own recording"),
+    ("file/out.csv", 1, "--write file: .*file is not a folder"),
+    ("file", 1, "--write file: .*file is not a folder; expected a folder"),
+])  # fmt: skip
 def test_destinations_refused_before_the_work(tmp_path, monkeypatch, capsys, write, trials, line):
     monkeypatch.chdir(tmp_path)
     for k in range(1, trials + 1):

@@ -532,26 +532,23 @@ def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
 B_IN_TWO = [one("a", 0.4), one("bx", 0.3, causes=("b",)), one("by", 0.3, causes=("b",))]
 
 
-@pytest.mark.parametrize(
-    ("sets", "more", "causes", "others"),
-    [
-        # Sets of the same causes count together; what was chosen, or forced, is named all the same.
-        (B_IN_TWO, {}, ("b",), ("a",)),
-        (B_IN_TWO, {"chosen": ("a",)}, ("a",), ()),
-        ([one("ab", 1.0, 0.0)], {"p_value": 0.9, "forced": ("b", "a")}, ("a", "b"), ()),
-        # What takes a cause's place is told down to one in twenty: an effect too small to be a cause is none
-        # beside an alternative either, and a larger set is no alternative.
-        ([one("a", 19 / 20), one("b", 1 / 20)], {}, ("a",), ("b",)),
-        ([one("a", 21 / 22), one("b", 1 / 22)], {}, ("a",), ()),
-        ([one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))], {}, ("a",), ("b",)),
-        ([one("a", 0.5), one("bc", 0.5)], {}, ("a",), ()),
-        # What a set can do without is no cause, unless that is ruled out or leaves too much.
-        ([one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)], {}, ("a",), ()),
-        ([one("ab", 0.96), one("a", 0.03)], {}, ("a", "b"), ()),
-        ([one("ab", 0.6), one("a", 0.3, 0.01)], {}, ("a", "b"), ()),
-        ([one("ab", 0.6), one("c", 0.3)], {}, ("a", "b"), ("c",)),  # not a part of the set but an alternative
-    ],
-)
+@pytest.mark.parametrize(("sets", "more", "causes", "others"), [
+    # Sets of the same causes count together; what was chosen, or forced, is named all the same.
+    (B_IN_TWO, {}, ("b",), ("a",)),
+    (B_IN_TWO, {"chosen": ("a",)}, ("a",), ()),
+    ([one("ab", 1.0, 0.0)], {"p_value": 0.9, "forced": ("b", "a")}, ("a", "b"), ()),
+    # What takes a cause's place is told down to one in twenty: an effect too small to be a cause is none
+    # beside an alternative either, and a larger set is no alternative.
+    ([one("a", 19 / 20), one("b", 1 / 20)], {}, ("a",), ("b",)),
+    ([one("a", 21 / 22), one("b", 1 / 22)], {}, ("a",), ()),
+    ([one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))], {}, ("a",), ("b",)),
+    ([one("a", 0.5), one("bc", 0.5)], {}, ("a",), ()),
+    # What a set can do without is no cause, unless that is ruled out or leaves too much.
+    ([one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)], {}, ("a",), ()),
+    ([one("ab", 0.96), one("a", 0.03)], {}, ("a", "b"), ()),
+    ([one("ab", 0.6), one("a", 0.3, 0.01)], {}, ("a", "b"), ()),
+    ([one("ab", 0.6), one("c", 0.3)], {}, ("a", "b"), ("c",)),  # not a part of the set but an alternative
+])  # fmt: skip
 def test_causes_and_what_takes_their_place(sets, more, causes, others):
     told = conclude(sets, **{"p_value": SURE} | more)
     assert (told.causes, told.indistinguishable) == (causes, others)

@@ -97,27 +97,24 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
     np.testing.assert_allclose(Held(np.zeros(1), np.arange(0, 0.02, 0.005))(np.ones(1), 1.0), np.ones(4))
 
 
-@pytest.mark.parametrize(
-    ("described", "line"),
-    [
-        (MAP.replace('"pivot"', '"pivott"'),
-         r"columns\.q: the model has no joint pivott.*did you mean pivot"),
-        (MAP.replace("joint =", "joints ="), r"columns\.q\.joints: unknown key.*did you mean joint"),
-        (MAP.replace('joint = "pivot"', 'kind = "position"'), "columns.q: names no thing of the model"),
-        (MAP.replace("1e-4", "-1"), r"columns\.q\.noise: Input should be greater than 0 .found -1"),
-        (MAP.replace('"Nm"', '"furlong"'), "columns.u.unit: unknown unit 'furlong'"),
-        (MAP.replace('joint = "pivot"', 'joint = "pivot"\nunit = "kg"'),
-         r"columns\.q\.unit: 'kg' of a position that is read in rad; expected a unit of angle"),
-        (MAP.replace('[columns.u]\nactuator = "m"\nunit = "Nm"', "[colums.u]"), "colums: unknown key"),
-        *((f"{said}\n{MAP}", line) for said, line in [
-            ("window = 0", "window.*greater than 0"), ("window = -1", "window.*greater than 0"),
-            ("window = 1e9", "window.*equal to 1000000"), ('window = "long"', "window"),
-            ("window = nan", "window"), ("time = 3", "time"), ("time = []", "time"),
-            ('time = {column = "t", unit = "parsec"}', "unit"), ("keyframe = 3", "keyframe.*valid string"),
-            ('keyframe = "home"', "no keyframe home"), ("windw = 1", "windw"),
-        ]),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("described", "line"), [
+    (MAP.replace('"pivot"', '"pivott"'),
+     r"columns\.q: the model has no joint pivott.*did you mean pivot"),
+    (MAP.replace("joint =", "joints ="), r"columns\.q\.joints: unknown key.*did you mean joint"),
+    (MAP.replace('joint = "pivot"', 'kind = "position"'), "columns.q: names no thing of the model"),
+    (MAP.replace("1e-4", "-1"), r"columns\.q\.noise: Input should be greater than 0 .found -1"),
+    (MAP.replace('"Nm"', '"furlong"'), "columns.u.unit: unknown unit 'furlong'"),
+    (MAP.replace('joint = "pivot"', 'joint = "pivot"\nunit = "kg"'),
+     r"columns\.q\.unit: 'kg' of a position that is read in rad; expected a unit of angle"),
+    (MAP.replace('[columns.u]\nactuator = "m"\nunit = "Nm"', "[colums.u]"), "colums: unknown key"),
+    *((f"{said}\n{MAP}", line) for said, line in [
+        ("window = 0", "window.*greater than 0"), ("window = -1", "window.*greater than 0"),
+        ("window = 1e9", "window.*equal to 1000000"), ('window = "long"', "window"),
+        ("window = nan", "window"), ("time = 3", "time"), ("time = []", "time"),
+        ('time = {column = "t", unit = "parsec"}', "unit"), ("keyframe = 3", "keyframe.*valid string"),
+        ('keyframe = "home"', "no keyframe home"), ("windw = 1", "windw"),
+    ]),
+])  # fmt: skip
 def test_a_map_at_fault_is_said_in_a_line(files, described, line):
     with pytest.raises(InputError, match=line):
         load_mjcf(*files(described=described))

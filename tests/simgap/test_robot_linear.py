@@ -84,17 +84,11 @@ def test_whitened_residuals_of_a_true_model_are_white():
     assert abs(np.mean((residual[1:] * residual[:-1])[inside])) < 0.06
 
 
-@pytest.mark.parametrize(
-    ("effect", "values"),
-    [
-        ("viscous", {"viscous": 4e-4}),
-        ("gravity_torque", {"gravity_torque": 0.505}),
-        ("readout:angle.bias", {"bias": 2e-3}),
-        ("readout:angle.lag", {"delay": 1e-3}),
-        ("command.delay", {"delay": 2e-3}),
-        ("readout:angle.gain", {"gain": 2e-3}),
-    ],
-)
+@pytest.mark.parametrize(("effect", "values"), [
+    ("viscous", {"viscous": 4e-4}), ("gravity_torque", {"gravity_torque": 0.505}),
+    ("readout:angle.bias", {"bias": 2e-3}), ("readout:angle.lag", {"delay": 1e-3}),
+    ("command.delay", {"delay": 2e-3}), ("readout:angle.gain", {"gain": 2e-3}),
+])  # fmt: skip
 def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
     """A small effect, starts read through it too, changes the residual by its Jacobian times it."""
     recording = log(3, noise=1e-9)
