@@ -309,7 +309,7 @@ def release(seed: int, slip: float | None = None) -> Change:
     return Change((c,), Prior(T, probability, (0.0, 1.0)), False, "smooth", 0.0, slips)
 
 
-def test_a_grip_that_slides_before_it_ends_may_have_ended_then():
+def test_a_grip_that_slides_before_it_ends_may_have_ended_then_and_another_ends_when_it_did():
     (known,) = discrepancies([release(k) for k in range(40)]).values()
     change = release(99, slip=3e-4)
     place = change.contacts[0].place
@@ -319,10 +319,6 @@ def test_a_grip_that_slides_before_it_ends_may_have_ended_then():
     assert found.quantile(0.05) < slides + 2e-3 and found.quantile(0.95) > spent - 2e-3
     assert plain.quantile(0.05) > slides + 10e-3
     assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
-
-
-def test_a_grip_that_does_not_slide_ends_when_it_did():
-    (known,) = discrepancies([release(k) for k in range(40)]).values()
     for seed in range(90, 95):
         found, plain = moment(release(seed, slip=0.0), known), moment(release(seed), known)
         assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 1e-3

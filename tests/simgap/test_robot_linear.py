@@ -22,10 +22,10 @@ from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
 
-def composed(recordings, length: float = 0.4) -> Composed:
-    simulator = checked(Swing(), "Swing")
+def composed(recordings, robot=Swing) -> Composed:
+    simulator = checked(robot(), robot.__name__)
     effects = candidates(Setting(simulator, recordings))
-    return Composed.of(simulator, recordings, effects, noises(simulator, recordings), length)
+    return Composed.of(simulator, recordings, effects, noises(simulator, recordings))
 
 
 def whitened(model: Composed, point=None, effects=()):
@@ -187,9 +187,7 @@ def test_numerics_are_exact_at_a_point_and_constant_about_it():
             found = super().simulate(parameters, recording, start)["angle"]
             return {"angle": found * (1 + 0.01 * parameters["step"])}
 
-    simulator, logs = checked(Stepped(), "here"), [log(0, seconds=1.0)]
-    effects = candidates(Setting(simulator, logs))
-    made = Composed.of(simulator, logs, effects, noises(simulator, logs))
+    made = composed([log(0, seconds=1.0)], Stepped)
     runs.clear()
     point = {"step": {"step": 0.5}}
     linear = linearise(made, point, ["viscous", "inertia"])
@@ -266,8 +264,5 @@ def test_a_model_that_explodes_at_a_candidate_is_said_and_the_others_go_on():
             found = super().simulate(parameters, recording, start)
             return found if parameters["charge"] == 0 else {n: v * np.inf for n, v in found.items()}
 
-    simulator, logs = checked(Explosive(), "Explosive"), [log(0, seconds=2.0)]
-    effects = candidates(Setting(simulator, logs))
-    composed = Composed.of(simulator, logs, effects, noises(simulator, logs))
-    linear = linearise(composed, {}, ["charge", "viscous"])
+    linear = linearise(composed([log(0, seconds=2.0)], Explosive), {}, ["charge", "viscous"])
     assert linear.diverged == ("charge",) and set(linear.moved) == {"viscous"}
