@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from test_architecture import imported_packages
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -44,12 +45,7 @@ def imported(source: str) -> tuple[set[str], set[str]]:
     tree = ast.parse(source)
 
     def names(nodes) -> set[str]:
-        found: set[str] = set()
-        for node in nodes:
-            if isinstance(node, ast.Import):
-                found |= {alias.name.split(".")[0] for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-                found.add(node.module.split(".")[0])
+        found = imported_packages(nodes)
         return {DISTRIBUTIONS.get(n, n) for n in found if n not in sys.stdlib_module_names and n not in OURS}
 
     return names(tree.body), names(ast.walk(tree))

@@ -31,11 +31,7 @@ from hmmseg.io.task import GROUND, BlockTask, Move
 from hmmseg.jaxconfig import configure
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.simulate import simulate_trials
-from simgap.world.virtual_model import (
-    Surroundings,
-    VirtualModel,
-    _program,
-)
+from simgap.world.virtual_model import Surroundings, VirtualModel, _program
 
 TASK = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
 PADS = Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0)

@@ -118,21 +118,13 @@ def outside_of(file: Path | None) -> Mapping[str, Made]:
 
 def _label(case: Case, trials: list[Recorded]) -> dict:
     return {
-        "case": case.name,
-        "seed": case.seed,
-        "tier": case.tier,
-        "world": asdict(case.world),
-        "brackets": case.world.brackets(),
-        "subtasks": list(case.world.work.subtasks),
-        "effects": case.effects,
-        "sizes": case.sizes,
-        "exclude": list(case.exclude),
-        "measured": case.measured,
-        "blocks": {n: asdict(b) for n, b in case.blocks.items()},
-        "boundaries": [list(r.boundaries) for r in trials],
-        "shift": [_rounded(r.shift) for r in trials],
+        "case": case.name, "seed": case.seed, "tier": case.tier, "world": asdict(case.world),
+        "brackets": case.world.brackets(), "subtasks": list(case.world.work.subtasks),
+        "effects": case.effects, "sizes": case.sizes, "exclude": list(case.exclude),
+        "measured": case.measured, "blocks": {n: asdict(b) for n, b in case.blocks.items()},
+        "boundaries": [list(r.boundaries) for r in trials], "shift": [_rounded(r.shift) for r in trials],
         "spread": [_rounded(r.spread) for r in trials],
-    }
+    }  # fmt: skip
 
 
 def _rounded(table: dict[str, list[float]]) -> dict[str, list[float]]:

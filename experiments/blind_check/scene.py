@@ -212,11 +212,7 @@ class Task:
 TASKS = {
     task.name: task
     for task in (
-        Task(
-            "reversal",
-            {"block1": "block2", "block2": GROUND},
-            (("block1", GROUND), ("block2", "block1")),
-        ),
+        Task("reversal", {"block1": "block2", "block2": GROUND}, (("block1", GROUND), ("block2", "block1"))),
         Task("transport", {"block1": GROUND}, (("block1", GROUND),)),
         Task("stacking", {"block1": GROUND, "block2": GROUND}, (("block1", "block2"),)),
         Task(

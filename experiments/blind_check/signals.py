@@ -109,17 +109,10 @@ def task_space(rig: Rig, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray
     v = np.einsum("nfxj,nfj->nfx", jacobians(rig, q), dq.reshape(-1, 2, 2)).reshape(-1, 4)
     fx1, fy1, fx2, fy2 = (columns[c] for c in ("fx1", "fy1", "fx2", "fy2"))
     return {
-        "x": (p[:, 0] + p[:, 2]) / 2,
-        "y": (p[:, 1] + p[:, 3]) / 2,
-        "distance": p[:, 2] - p[:, 0],
-        "offset": p[:, 3] - p[:, 1],
-        "vx": (v[:, 0] + v[:, 2]) / 2,
-        "vy": (v[:, 1] + v[:, 3]) / 2,
-        "fx": fx1 + fx2,
-        "fy": fy1 + fy2,
-        "grip": (fx1 - fx2) / 2,
-        "shear": (fy1 - fy2) / 2,
-    }
+        "x": (p[:, 0] + p[:, 2]) / 2, "y": (p[:, 1] + p[:, 3]) / 2, "distance": p[:, 2] - p[:, 0],
+        "offset": p[:, 3] - p[:, 1], "vx": (v[:, 0] + v[:, 2]) / 2, "vy": (v[:, 1] + v[:, 3]) / 2,
+        "fx": fx1 + fx2, "fy": fy1 + fy2, "grip": (fx1 - fx2) / 2, "shear": (fy1 - fy2) / 2,
+    }  # fmt: skip
 
 
 def noise_of_channels(rig: Rig, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -129,17 +122,10 @@ def noise_of_channels(rig: Rig, columns: dict[str, np.ndarray]) -> dict[str, np.
     both = np.hypot(size[:, 0], size[:, 1])
     a, v, f = rig.angle_noise, rig.velocity_noise, np.full(len(q), rig.force_noise)
     return {
-        "x": a * both[:, 0] / 2,
-        "y": a * both[:, 1] / 2,
-        "distance": a * both[:, 0],
-        "offset": a * both[:, 1],
-        "vx": v * both[:, 0] / 2,
-        "vy": v * both[:, 1] / 2,
-        "fx": f * np.sqrt(2),
-        "fy": f * np.sqrt(2),
-        "grip": f / np.sqrt(2),
-        "shear": f / np.sqrt(2),
-    }
+        "x": a * both[:, 0] / 2, "y": a * both[:, 1] / 2, "distance": a * both[:, 0],
+        "offset": a * both[:, 1], "vx": v * both[:, 0] / 2, "vy": v * both[:, 1] / 2, "fx": f * np.sqrt(2),
+        "fy": f * np.sqrt(2), "grip": f / np.sqrt(2), "shear": f / np.sqrt(2),
+    }  # fmt: skip
 
 
 # Stages that effects put in: drift, rotation, delay, play, loads, ringing.

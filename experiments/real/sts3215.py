@@ -200,12 +200,9 @@ def scored(case: Case, found: Changes) -> dict[str, Any]:
             one = told[name]
             low, high = one["ratio_90"]
             out["sizes"][name] = {
-                "ratio": one["ratio"],
-                "interval": [low, high],
-                "true": ratio,
-                "off": one["ratio"] / ratio - 1,
-                "holds": low <= ratio <= high,
-            }
+                "ratio": one["ratio"], "interval": [low, high], "true": ratio,
+                "off": one["ratio"] / ratio - 1, "holds": low <= ratio <= high,
+            }  # fmt: skip
     return out
 
 

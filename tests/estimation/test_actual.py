@@ -22,30 +22,25 @@ def test_reads_values_with_deviations(tmp_path):
     }
 
 
-@pytest.mark.parametrize("entry, message", [
-    ({"unit": "kg", "value": 1.0}, "key block1.weight.unit: found 'kg'; expected \"N\""),
-    ({"value": 1.0}, "key block1.weight.unit: found None"),
-    ({"unit": "N"}, "key block1.weight.value: found None; expected a number > 0"),
-    ({"unit": "N", "value": 0.0}, "key block1.weight.value: found 0.0; expected a number > 0"),
-    ({"unit": "N", "value": True}, "key block1.weight.value: found True"),
-    ({"unit": "N", "value": float("nan")}, "key block1.weight.value: found nan"),
-    ({"unit": "N", "value": 1.0, "sd": -0.1}, "key block1.weight.sd: found -0.1; expected a number >= 0"),
-    ({"unit": "N", "value": 1.0, "sdd": 0.1}, "key block1.weight.sdd: unknown key; expected one of sd, "),
-    (0.3, "key block1.weight: found 0.3; expected a table with unit, value and sd"),
-])  # fmt: skip
-def test_refused_entries(entry, message):
-    with pytest.raises(InputError, match=re.escape(message)):
-        parse_actual({"block1": {"weight": entry}}, ["block1"])
-
-
 @pytest.mark.parametrize("table, message", [
+    *(({"block1": {"weight": entry}}, message) for entry, message in [
+        ({"unit": "kg", "value": 1.0}, "key block1.weight.unit: found 'kg'; expected \"N\""),
+        ({"value": 1.0}, "key block1.weight.unit: found None"),
+        ({"unit": "N"}, "key block1.weight.value: found None; expected a number > 0"),
+        ({"unit": "N", "value": 0.0}, "key block1.weight.value: found 0.0; expected a number > 0"),
+        ({"unit": "N", "value": True}, "key block1.weight.value: found True"),
+        ({"unit": "N", "value": float("nan")}, "key block1.weight.value: found nan"),
+        ({"unit": "N", "value": 1.0, "sd": -0.1}, "key block1.weight.sd: found -0.1; expected a number >= 0"),
+        ({"unit": "N", "value": 1.0, "sdd": 0.1}, "key block1.weight.sdd: unknown key; expected one of sd, "),
+        (0.3, "key block1.weight: found 0.3; expected a table with unit, value and sd"),
+    ]),
     ({"blok1": GOOD["block1"]}, "key blok1: is not an object of the task; expected one of block1, block2 "
                                 "(did you mean block1?)"),
     ({"block1": {"wieght": {}}}, "key block1.wieght: unknown property; expected one of friction, height, "
                                  "weight, width (did you mean weight?)"),
     ({"block1": 3}, "key block1: found 3; expected tables [block1.PROPERTY]"),
 ])  # fmt: skip
-def test_refused_tables(table, message):
+def test_refused_entries_and_tables(table, message):
     with pytest.raises(InputError, match=re.escape(message)):
         parse_actual(table, ["block1", "block2"])
 

@@ -286,12 +286,11 @@ def test_dropouts_and_missing_samples_are_left_out():
 
 
 def test_what_the_task_or_the_recording_withholds_is_none_with_a_reason():
-    pick = BlockTask({"block": "ground"}, (Move("block", "ground"),))
-    steps = subtasks(pick)
+    steps = subtasks(PICK)
     stack, segmentation = make(STACK, RESTS["stack"])
     names = {"block1": "block", "block2": "block"}
     spans = tuple(replace(s, object=names[str(s.object)]) for s in segmentation.spans[: len(steps)])
-    properties, reasons = estimate_plugin([stack], [replace(segmentation, spans=spans)], pick)
+    properties, reasons = estimate_plugin([stack], [replace(segmentation, spans=spans)], PICK)
     assert properties["block"]["height"] is None
     assert "height" in reasons["block.height"]
     assert properties["block"]["weight"] is not None
@@ -303,8 +302,7 @@ def test_what_the_task_or_the_recording_withholds_is_none_with_a_reason():
     assert set(reasons) == {f"block2.{p}" for p in ("weight", "width", "friction")} | {"block1.height"}
     json.dumps(properties, allow_nan=False)
 
-    slide = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
-    assert "block" in estimate_plugin([stack], [replace(half, spans=())], slide)[1]["block.weight"]
+    assert "block" in estimate_plugin([stack], [replace(half, spans=())], SLIDE)[1]["block.weight"]
 
 
 def test_heights_that_only_sums_reveal_are_not_guessed():

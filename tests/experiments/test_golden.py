@@ -34,14 +34,11 @@ def test_every_folder_is_pinned():
         assert sorted(read(kind)) == folders()
 
 
-@pytest.mark.parametrize(
-    "path, by",
-    [
-        (("identified", "none_1", "boundaries", 0, 3, 0), 2e-3),
-        (("diagnosed", "force_bias_1", "shares", "force_bias"), 0.06),
-        (("diagnosed", "force_bias_1", "shrinkage"), -0.06),
-    ],
-)
+@pytest.mark.parametrize("path, by", [
+    (("identified", "none_1", "boundaries", 0, 3, 0), 2e-3),
+    (("diagnosed", "force_bias_1", "shares", "force_bias"), 0.06),
+    (("diagnosed", "force_bias_1", "shrinkage"), -0.06),
+])  # fmt: skip
 def test_what_moves_by_more_than_it_may_is_seen(path: tuple, by: float):
     old = read(path[0])[path[1]]
     new = copy.deepcopy(old)

@@ -153,15 +153,11 @@ def test_a_recording_that_stops_halfway_is_no_replay(tmp_path, capsys):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(
-    ("read", "content"),
-    [
-        *(("operator", text) for text in ("[1]", "3", "[" * 100_000, '{"pace": []}', '{"pace": {"a": 1}}')),
-        *(("properties", text) for text in ("[1]", "{}", '{"properties": 3}', "[" * 100_000)),
-        ("properties", '{"properties": {"a": []}}'),
-    ],
-    ids=lambda value: value[:20],
-)  # fmt: skip
+@pytest.mark.parametrize(("read", "content"), [
+    *(("operator", text) for text in ("[1]", "3", "[" * 100_000, '{"pace": []}', '{"pace": {"a": 1}}')),
+    *(("properties", text) for text in ("[1]", "{}", '{"properties": 3}', "[" * 100_000)),
+    ("properties", '{"properties": {"a": []}}'),
+], ids=lambda value: value[:20])  # fmt: skip
 def test_documents_that_are_none(read, content, tmp_path):
     path = tmp_path / "made.json"
     path.write_text(content)

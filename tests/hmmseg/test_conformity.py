@@ -60,17 +60,14 @@ def test_misfits_are_found_at_the_subtask_that_fails(edit, which):
     assert (REASONS.get(edit, "") if which == 0 else "") in document["failed"]["reason"]
 
 
-@pytest.mark.parametrize(
-    ("world", "number"),
-    [
-        ("noise x16", 60061),  # a load of four standard errors
-        ("noise x16", 60115),
-        ("missing 40 %", 60075),  # heights that take four angles
-        ("missing 40 %", 60186),
-        ("ringing 1 N", 60008),  # fingers that pass a block's width while they ring in the air
-        ("ringing 1 N", 60028),
-    ],
-)
+@pytest.mark.parametrize(("world", "number"), [
+    ("noise x16", 60061),  # a load of four standard errors
+    ("noise x16", 60115),
+    ("missing 40 %", 60075),  # heights that take four angles
+    ("missing 40 %", 60186),
+    ("ringing 1 N", 60008),  # fingers that pass a block's width while they ring in the air
+    ("ringing 1 N", 60028),
+])  # fmt: skip
 def test_poor_recordings_are_no_misfits_and_a_fall_in_them_is_told(world, number):
     (healthy,) = replicates(WORLDS[world], [number])
     (found,) = segmentation.segment(healthy.trials, healthy.task, healthy.rig)
@@ -122,14 +119,11 @@ def test_a_bounce_at_touchdown_is_no_drop():
     assert found.complete
 
 
-@pytest.mark.parametrize(
-    "way, numbers",
-    [
-        (World("", untidy="tapping"), [70000, 70001]),
-        (World("", untidy="slipping"), [70000, 70001]),
-        (World("", Cell(rate=100.0), untidy="tapping"), [77000, 77013]),
-    ],
-)
+@pytest.mark.parametrize("way, numbers", [
+    (World("", untidy="tapping"), [70000, 70001]),
+    (World("", untidy="slipping"), [70000, 70001]),
+    (World("", Cell(rate=100.0), untidy="tapping"), [77000, 77013]),
+])  # fmt: skip
 def test_touches_before_a_grip_and_a_grip_that_slips_are_no_misfit(way, numbers):
     """Nor do they move a boundary by a sample of 50 ms. The last two tap for more than 0.2 s, but lightly."""
     _, task = scene()

@@ -15,22 +15,8 @@ from hmmseg.hmm import Chain, em
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.segmentation import fit as contact_fit
-from hmmseg.segmentation.emissions import (
-    RUNG,
-    Features,
-    Parameters,
-    _log_ungripped,
-    log_likelihoods,
-)
-from hmmseg.segmentation.fit import (
-    _location,
-    _scale,
-    chain_of,
-    fit,
-    initial_parameters,
-    mean_shares,
-    otsu,
-)
+from hmmseg.segmentation.emissions import RUNG, Features, Parameters, _log_ungripped, log_likelihoods
+from hmmseg.segmentation.fit import _location, _scale, chain_of, fit, initial_parameters, mean_shares, otsu
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))

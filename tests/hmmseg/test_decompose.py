@@ -27,11 +27,6 @@ TOWER = BlockTask(
 SLIDE = BlockTask({"a": GROUND}, (Move("a", GROUND, slide=True),))
 
 
-def revealed(found: Decomposition, index: int, paper: bool = False) -> set[str]:
-    return {f"{entry.object}.{entry.name}" for entry, _ in found.reveals(index)
-            if not paper or found.in_paper(index, entry)}  # fmt: skip
-
-
 def ways(found: Decomposition, owner: str, name: str) -> list[tuple[int, ...]]:
     return [evidence.subtasks for evidence in found.properties[owner][name].evidence]
 
@@ -50,21 +45,6 @@ def test_the_papers_states():
     assert found[1].constraints == ("block1-block2", "finger1-block1", "finger2-block1")
     assert found[2].constraints == ("finger1-block1", "finger2-block1")
     assert found[4].constraints == ()
-
-
-def test_the_papers_equation_1():
-    found = decompose(PAPER)
-    assert [revealed(found, i, paper=True) for i in range(9)] == [
-        set(),
-        {"block2.height", "block1.friction"},
-        {"block1.weight", "block1.width", "block1.friction"},
-        {"block2.height", "block1.friction"},
-        set(),
-        {"block1.height", "block2.friction"},
-        {"block2.weight", "block2.width", "block2.friction"},
-        {"block1.height", "block2.friction"},
-        set(),
-    ]
 
 
 def test_the_papers_table_1_names_its_signals():

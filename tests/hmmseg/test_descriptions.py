@@ -96,13 +96,10 @@ GRIPPERS = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("table", "message"),
-    [
-        *(({**HAND, **table}, message) for table, message in REFUSED),
-        *(({"gripper": table}, f"rig: {message}") for table, message in GRIPPERS),
-    ],
-)
+@pytest.mark.parametrize(("table", "message"), [
+    *(({**HAND, **table}, message) for table, message in REFUSED),
+    *(({"gripper": table}, f"rig: {message}") for table, message in GRIPPERS),
+])  # fmt: skip
 def test_refused_with_its_message(table, message):
     with pytest.raises(InputError, match=f"^{message}") as caught:
         parse_rig(table)

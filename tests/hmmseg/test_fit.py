@@ -144,14 +144,11 @@ def test_a_state_that_comes_twice_is_one():
         np.testing.assert_allclose(found(result), boundaries, atol=0.06)
 
 
-@pytest.mark.parametrize(
-    ("sequence", "index"),
-    [
-        (("wait", "push", "pull"), 2),
-        (("wait", "push", "turn"), 3),
-        (("wait", "push", "wait", "push", "turn", "pull"), 1),
-    ],
-)
+@pytest.mark.parametrize(("sequence", "index"), [
+    (("wait", "push", "pull"), 2),
+    (("wait", "push", "turn"), 3),
+    (("wait", "push", "wait", "push", "turn", "pull"), 1),
+])  # fmt: skip
 def test_a_trial_that_leaves_its_task_says_where(sequence, index):
     result = segment_sequence([record(70, sequence=sequence)[0]], TASK, taught())[0]
     assert not result.complete
@@ -171,35 +168,23 @@ def test_saved_models_segment_alike(tmp_path):
     assert segment_sequence([trial], TASK, loaded) == segment_sequence([trial], TASK, taught())
 
 
-def broken_models(tmp_path):
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"format": "hmmseg.sequence-model/9"}, r"has format 'hmmseg.sequence-model/9'; expected"),
+    ({"loc": None}, "lacks loc; expected a complete model"),
+    ({"typical": np.ones(3)}, r"typical has shape \(3,\); expected finite numbers of shape \(4,\)"),
+    ({"scale": np.full(4, np.nan)}, r"scale is not finite; expected finite numbers of shape \(4,\)"),
+    ({"temper": np.nan}, r"temper is not finite; expected finite numbers of shape \(\)"),
+    ({"step": np.inf}, "step is not finite"),
+    ({"detectors.weight": np.nan}, r"detectors\.weight is not finite"),
+    ({"sequence": np.array(["a", "b", "c", "d"])}, r"was learned for sequence \['a', 'b', 'c', 'd'\]"),
+    ({"detectors.mean": np.zeros((1, 1, 1))}, "detectors"),
+])  # fmt: skip
+def test_bad_model_files_are_refused(tmp_path, changes, message):
     path = tmp_path / "m.npz"
     save_model(taught(), path)
     with np.load(path) as file:
-        table = dict(file)
-
-    def written(**changes):
-        np.savez(path, **{k: v for k, v in {**table, **changes}.items() if v is not None})
-
-    return path, written
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"format": "hmmseg.sequence-model/9"}, r"has format 'hmmseg.sequence-model/9'; expected"),
-        ({"loc": None}, "lacks loc; expected a complete model"),
-        ({"typical": np.ones(3)}, r"typical has shape \(3,\); expected finite numbers of shape \(4,\)"),
-        ({"scale": np.full(4, np.nan)}, r"scale is not finite; expected finite numbers of shape \(4,\)"),
-        ({"temper": np.nan}, r"temper is not finite; expected finite numbers of shape \(\)"),
-        ({"step": np.inf}, "step is not finite"),
-        ({"detectors.weight": np.nan}, r"detectors\.weight is not finite"),
-        ({"sequence": np.array(["a", "b", "c", "d"])}, r"was learned for sequence \['a', 'b', 'c', 'd'\]"),
-        ({"detectors.mean": np.zeros((1, 1, 1))}, "detectors"),
-    ],
-)
-def test_bad_model_files_are_refused(tmp_path, changes, message):
-    path, written = broken_models(tmp_path)
-    written(**changes)
+        table = dict(file) | changes
+    np.savez(path, **{k: v for k, v in table.items() if v is not None})
     with pytest.raises(InputError, match=message):
         load_model(path, TASK)
 
@@ -215,22 +200,19 @@ def test_files_that_are_no_models_are_refused(tmp_path):
         load_model(tmp_path / "m.npz", dataclasses.replace(TASK, channels=("a", "c")))
 
 
-@pytest.mark.parametrize(
-    ("labels", "message"),
-    [
-        ({"trial_0": [1.0]}, "has 1 boundaries; expected 3 for 4 subtasks"),
-        ({"trial_0": [1.0, 0.5, 2.0]}, r"boundary 2 \(0.5\) does not come after boundary 1 \(1\)"),
-        ({"trial_0": [1.0, 2.0, 2.0]}, "does not come after"),
-        ({"trial_0": [1.0, 2.0, 99.0]}, "times between 0 and"),
-        ({"trial_0": [1.0, np.nan, 2.0]}, "a boundary that is no number"),
-        ({"trial_0": ["x", 1, 2]}, "a list of times in s"),
-        ({"other": [1.0, 2.0, 3.0]}, "none is for these trials"),
-        ({"trial_0": [None, None, None]}, "has no boundary"),
-        ({"trial_0": {"lift": 2.0}}, "gives the start of 'lift', which has none in this task"),
-        ({"trial_0": {"wait": 2.0}}, "gives the start of 'wait'"),
-        ({"trial_0": {"pull": 99.0}}, "times between 0 and"),
-    ],
-)
+@pytest.mark.parametrize(("labels", "message"), [
+    ({"trial_0": [1.0]}, "has 1 boundaries; expected 3 for 4 subtasks"),
+    ({"trial_0": [1.0, 0.5, 2.0]}, r"boundary 2 \(0.5\) does not come after boundary 1 \(1\)"),
+    ({"trial_0": [1.0, 2.0, 2.0]}, "does not come after"),
+    ({"trial_0": [1.0, 2.0, 99.0]}, "times between 0 and"),
+    ({"trial_0": [1.0, np.nan, 2.0]}, "a boundary that is no number"),
+    ({"trial_0": ["x", 1, 2]}, "a list of times in s"),
+    ({"other": [1.0, 2.0, 3.0]}, "none is for these trials"),
+    ({"trial_0": [None, None, None]}, "has no boundary"),
+    ({"trial_0": {"lift": 2.0}}, "gives the start of 'lift', which has none in this task"),
+    ({"trial_0": {"wait": 2.0}}, "gives the start of 'wait'"),
+    ({"trial_0": {"pull": 99.0}}, "times between 0 and"),
+])  # fmt: skip
 def test_bad_labels_are_refused(labels, message):
     with pytest.raises(InputError, match=message):
         fit_sequence([record(0)[0]], TASK, labels)

@@ -260,6 +260,7 @@ def test_a_topic_that_is_not_there(tmp_path):
 
 
 NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
+HAND = ["--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"), "--method", "qualitative"]
 
 
 def span(name, start, end, start_sd=0.0, end_sd=0.0, obj=None):
@@ -287,8 +288,7 @@ def test_segment_writes_columns(tmp_path, kind):
     source = tmp_path / f"trial.{kind}"
     frame = pd.read_csv(NONE / "trial_01.csv").assign(note="kept")
     frame.to_csv(source, index=False) if kind == "csv" else frame.to_parquet(source)
-    args = ["segment", str(source), "--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"),
-            "--method", "qualitative", "--quiet", "--json", str(tmp_path / "a.json")]  # fmt: skip
+    args = ["segment", str(source), *HAND, "--quiet", "--json", str(tmp_path / "a.json")]
     assert main([*args, "--write", str(tmp_path / f"out.{kind}")]) == 0
     back = pd.read_csv(tmp_path / "out.csv") if kind == "csv" else pd.read_parquet(tmp_path / "out.parquet")
     assert list(back.columns) == [*frame.columns, *ADDED]
@@ -351,16 +351,13 @@ def test_a_lerobot_data_set_with_subtasks(tmp_path, version):
         lerobot_files(tmp_path / "new", {})
 
 
-@pytest.mark.parametrize(
-    ("write", "trials", "line"),
-    [
-        ("trial_01.csv", 1, "--write .*: would write over its own recording; expected another place"),
-        ("out.csv", 2, "--write out.csv: is one file for 2 recordings; expected a folder"),
-        (".", 1, "--write .: would write over its own recording"),
-        ("file/out.csv", 1, "--write file: .*file is not a folder"),
-        ("file", 1, "--write file: .*file is not a folder; expected a folder"),
-    ],
-)
+@pytest.mark.parametrize(("write", "trials", "line"), [
+    ("trial_01.csv", 1, "--write .*: would write over its own recording; expected another place"),
+    ("out.csv", 2, "--write out.csv: is one file for 2 recordings; expected a folder"),
+    (".", 1, "--write .: would write over its own recording"),
+    ("file/out.csv", 1, "--write file: .*file is not a folder"),
+    ("file", 1, "--write file: .*file is not a folder; expected a folder"),
+])  # fmt: skip
 def test_destinations_refused_before_the_work(tmp_path, monkeypatch, capsys, write, trials, line):
     monkeypatch.chdir(tmp_path)
     for k in range(1, trials + 1):
@@ -368,8 +365,7 @@ def test_destinations_refused_before_the_work(tmp_path, monkeypatch, capsys, wri
     Path("file").write_text("")
     before = sorted(os.listdir())
     names = [f"trial_{k:02d}.csv" for k in range(1, trials + 1)]
-    assert main(["segment", *names, "--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"),
-                 "--method", "qualitative", "--write", write]) == 2  # fmt: skip
+    assert main(["segment", *names, *HAND, "--write", write]) == 2
     assert re.search(line, capsys.readouterr().err)
     assert sorted(os.listdir()) == before
 
@@ -377,8 +373,7 @@ def test_destinations_refused_before_the_work(tmp_path, monkeypatch, capsys, wri
 def test_labels_are_not_written_twice(tmp_path, capsys):
     frame = pd.read_csv(NONE / "trial_01.csv").assign(subtask=1)
     frame.to_csv(tmp_path / "a.csv", index=False)
-    assert main(["segment", str(tmp_path / "a.csv"), "--task", str(NONE / "task.toml"), "--rig",
-                 str(NONE / "rig.toml"), "--method", "qualitative", "--quiet", "--write",
-                 str(tmp_path / "b.csv")]) == 2  # fmt: skip
+    args = ["segment", str(tmp_path / "a.csv"), *HAND, "--quiet"]
+    assert main([*args, "--write", str(tmp_path / "b.csv")]) == 2
     assert "column subtask: is there already; expected a recording without labels" in capsys.readouterr().err
     assert os.listdir(tmp_path) == ["a.csv"]

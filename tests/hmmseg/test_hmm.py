@@ -198,25 +198,27 @@ def test_optional_states_may_be_passed_over():
     np.testing.assert_allclose(visits, presence, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: hmm.Chain(np.zeros(3), np.zeros(3)), r"log_advance: shape \(3,\), expected \(2,\)"),
-        (lambda: hmm.Chain(np.zeros((4, 3)), np.zeros((5, 2))), r"expected \(4, 2\) or \(2,\)"),
-        (lambda: hmm.Chain(np.zeros(3), np.zeros(2), np.zeros(2)), r"log_skip\[0\]: shape \(2,\)"),
-        (lambda: hmm.Chain(np.zeros((2, 2, 2)), np.zeros(2)), r"log_stay: shape \(2, 2, 2\)"),
-        (lambda: hmm.Chain([0, np.nan], [0.0]), r"log_stay: NaN or \+inf at \[1\]"),
-        (lambda: hmm.Chain([0, 1], [0.0], log_final=[0, np.inf]), r"log_final: NaN or \+inf at \[1\]"),
-        (lambda: hmm.Chain([0, 1], [0.0], log_initial=[0]), r"log_initial: shape \(1,\), expected \(2,\)"),
-        (lambda: hmm.viterbi(np.zeros((3, 2)), hmm.left_to_right([1, 1, 1])), "2 states, expected"),
-        (lambda: hmm.smooth(np.zeros(3), hmm.left_to_right([1])), r"log_likelihoods: shape \(3,\)"),
-        (lambda: hmm.smooth(np.zeros((9, 2)), hmm.Chain(np.zeros((4, 2)), [0.0])), "9 samples, expected 5"),
-        (lambda: hmm.viterbi(np.zeros((3, 1)), hmm.left_to_right([1]), 4), "lengths: 4, expected 1 to 3"),
-        (lambda: hmm.left_to_right([2.0, 3.0], [1.0]), r"presence: shape \(1,\), expected \(2,\)"),
-        (lambda: hmm.left_to_right([2.0], [0.0]), r"probabilities in \(0, 1\]"),
-        (lambda: hmm.smooth(np.full((3, 1), np.inf), hmm.left_to_right([1])), r"NaN or \+inf at \[0, 0\]"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda: hmm.Chain(np.zeros(3), np.zeros(3)), r"log_advance: shape \(3,\), expected \(2,\)"),
+    (lambda: hmm.Chain(np.zeros((4, 3)), np.zeros((5, 2))), r"expected \(4, 2\) or \(2,\)"),
+    (lambda: hmm.Chain(np.zeros(3), np.zeros(2), np.zeros(2)), r"log_skip\[0\]: shape \(2,\)"),
+    (lambda: hmm.Chain(np.zeros((2, 2, 2)), np.zeros(2)), r"log_stay: shape \(2, 2, 2\)"),
+    (lambda: hmm.Chain([0, np.nan], [0.0]), r"log_stay: NaN or \+inf at \[1\]"),
+    (lambda: hmm.Chain([0, 1], [0.0], log_final=[0, np.inf]), r"log_final: NaN or \+inf at \[1\]"),
+    (lambda: hmm.Chain([0, 1], [0.0], log_initial=[0]), r"log_initial: shape \(1,\), expected \(2,\)"),
+    (lambda: hmm.viterbi(np.zeros((3, 2)), hmm.left_to_right([1, 1, 1])), "2 states, expected"),
+    (lambda: hmm.smooth(np.zeros(3), hmm.left_to_right([1])), r"log_likelihoods: shape \(3,\)"),
+    (lambda: hmm.smooth(np.zeros((9, 2)), hmm.Chain(np.zeros((4, 2)), [0.0])), "9 samples, expected 5"),
+    (lambda: hmm.viterbi(np.zeros((3, 1)), hmm.left_to_right([1]), 4), "lengths: 4, expected 1 to 3"),
+    (lambda: hmm.left_to_right([2.0, 3.0], [1.0]), r"presence: shape \(1,\), expected \(2,\)"),
+    (lambda: hmm.left_to_right([2.0], [0.0]), r"probabilities in \(0, 1\]"),
+    (lambda: hmm.smooth(np.full((3, 1), np.inf), hmm.left_to_right([1])), r"NaN or \+inf at \[0, 0\]"),
+    (lambda: dense_viterbi(np.zeros((4, 2)), np.zeros(2), np.zeros(2)),
+     r"log_transition: shape \(2,\), expected \(2, 2\)"),
+    (lambda: dense_viterbi(np.full((4, 2), -np.inf), np.zeros(2), np.zeros((2, 2))), "no state path"),
+    (lambda: dense_evidence(np.array([[0, 0], [0, np.nan]]), np.zeros(2), np.zeros((2, 2))),
+     r"log_likelihoods: NaN at \[1, 1\]"),
+])  # fmt: skip
 def test_refusals(make, message):
     with pytest.raises(ValueError, match=message):
         make()
@@ -368,14 +370,3 @@ def test_states_of_almost_no_likelihood_keep_their_evidence():
     alone = initial[1] + ll[:, 1].sum() + 39 * transition[1, 1]
     np.testing.assert_allclose(dense_evidence(ll, initial, transition), alone)
     assert (dense_viterbi(ll, initial, transition).path == 1).all()
-
-
-def test_refusals_without_an_order():
-    ll, initial, transition = unordered(4, 2)
-    with pytest.raises(ValueError, match=r"log_transition: shape \(2,\), expected \(2, 2\)"):
-        dense_viterbi(ll, initial, initial)
-    with pytest.raises(ValueError, match="no state path"):
-        dense_viterbi(np.full((4, 2), -np.inf), initial, transition)
-    ll[1, 1] = np.nan
-    with pytest.raises(ValueError, match=r"log_likelihoods: NaN at \[1, 1\]"):
-        dense_evidence(ll, initial, transition)

@@ -137,21 +137,18 @@ def test_tables_of_lasting_have_their_moments():
     np.testing.assert_allclose(np.sqrt(p @ n**2 - (p @ n) ** 2), [10.0, 5.0], rtol=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: hmm.DurationChain([]), "expected one array a state"),
-        (lambda: hmm.DurationChain([np.zeros((2, 2))]), r"shape \(2, 2\) of state 0"),
-        (lambda: hmm.DurationChain([np.zeros(2), np.full(3, -np.inf)]), "state 1, expected numbers or -inf"),
-        (lambda: hmm.DurationChain([np.zeros(2)], [1.0, 1.0]), r"presence: shape \(2,\), expected \(1,\)"),
-        (lambda: hmm.DurationChain([np.zeros(2)], [1.5]), r"probabilities in \(0, 1\]"),
-        (lambda: hmm.DurationChain([np.zeros(2)], log_final=np.zeros(2)), r"log_final: shape \(2,\)"),
-        (lambda: hmm.lasting([3.0], [0.0]), "above 0"),
-        (lambda: hmm.StreamingFilter(hmm.lasting([3.0], [1.0]), 3), "tables of durations"),
-        (lambda: hmm.smooth([[0.0, np.nan]], hmm.lasting([3.0, 2.0], [1.0, 1.0])), "NaN"),
-        (lambda: hmm.filter(np.zeros((5, 2)), hmm.lasting([3.0, 2.0], [1.0, 1.0])), "tables of durations"),
-    ],
-)
+@pytest.mark.parametrize(("make", "said"), [
+    (lambda: hmm.DurationChain([]), "expected one array a state"),
+    (lambda: hmm.DurationChain([np.zeros((2, 2))]), r"shape \(2, 2\) of state 0"),
+    (lambda: hmm.DurationChain([np.zeros(2), np.full(3, -np.inf)]), "state 1, expected numbers or -inf"),
+    (lambda: hmm.DurationChain([np.zeros(2)], [1.0, 1.0]), r"presence: shape \(2,\), expected \(1,\)"),
+    (lambda: hmm.DurationChain([np.zeros(2)], [1.5]), r"probabilities in \(0, 1\]"),
+    (lambda: hmm.DurationChain([np.zeros(2)], log_final=np.zeros(2)), r"log_final: shape \(2,\)"),
+    (lambda: hmm.lasting([3.0], [0.0]), "above 0"),
+    (lambda: hmm.StreamingFilter(hmm.lasting([3.0], [1.0]), 3), "tables of durations"),
+    (lambda: hmm.smooth([[0.0, np.nan]], hmm.lasting([3.0, 2.0], [1.0, 1.0])), "NaN"),
+    (lambda: hmm.filter(np.zeros((5, 2)), hmm.lasting([3.0, 2.0], [1.0, 1.0])), "tables of durations"),
+])  # fmt: skip
 def test_what_cannot_be_is_said(make, said):
     with pytest.raises(ValueError, match=said):
         make()

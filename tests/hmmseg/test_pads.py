@@ -70,7 +70,7 @@ def test_releases_of_grips_that_ring_are_not_early():
 def test_holds_in_which_misread_forces_pull_say_nothing_of_a_delay():
     t = np.arange(0.0, 0.8, 0.02)
     pulls = Squeeze(t, np.full(t.size, 0.02), np.zeros(t.size), -1.0 - 0.1 * t, 2e-5, 0.01)
-    assert lateness([pulls], PRIOR) == Lateness()
+    assert lateness([pulls], PRIOR) == lateness([], PRIOR) == Lateness()
 
 
 @pytest.mark.parametrize("shift", [-0.003, 0.003])
@@ -195,10 +195,6 @@ def test_a_small_delay_is_found_and_is_no_sensor_s(delay):
     assert not found.late and found.delay == pytest.approx(delay, abs=max(3 * found.sd, 1e-3))
 
 
-def test_nothing_tells_nothing():
-    assert lateness([], PRIOR) == Lateness()
-
-
 def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
     fine = np.arange(0, 1.0, 1e-4)
     force = 4 * np.clip((fine - 0.31) / 0.2, 0, 1)
@@ -238,9 +234,6 @@ def test_straight_contacts_have_none_however_they_differ(compliances):
     assert all(find_toe(releases(compliances=compliances, seed=seed)) is NONE for seed in range(10))
 
 
-def test_a_contact_that_stiffens_the_other_way_has_none():
+def test_contacts_that_stiffen_the_other_way_and_too_few_samples_have_none():
     assert find_toe(releases(Toe(-4e-4, 0.8))) is NONE
-
-
-def test_too_few_samples_show_nothing():
     assert find_toe([]) is NONE and find_toe([(np.ones(3), np.ones(3), SD)]) is NONE

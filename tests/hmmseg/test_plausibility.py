@@ -196,15 +196,12 @@ def performed():
     return performances(1)[0]
 
 
-@pytest.mark.parametrize(
-    ("pairs", "line"),
-    [
-        ([("fx1", "fy1"), ("fx2", "fy2")], "column fx1: and y are exchanged: the fingers press against each"),
-        ([("x1", "y1"), ("x2", "y2"), ("vx1", "vy1"), ("vx2", "vy2")], "column x1: .* stand apart in a grip"),
-        ([(f"{a}x{i}", f"{a}y{i}") for a in ("", "v", "f") for i in (1, 2)],
-         "column x1: and y are exchanged"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("pairs", "line"), [
+    ([("fx1", "fy1"), ("fx2", "fy2")], "column fx1: and y are exchanged: the fingers press against each"),
+    ([("x1", "y1"), ("x2", "y2"), ("vx1", "vy1"), ("vx2", "vy2")], "column x1: .* stand apart in a grip"),
+    ([(f"{a}x{i}", f"{a}y{i}") for a in ("", "v", "f") for i in (1, 2)],
+     "column x1: and y are exchanged"),
+])  # fmt: skip
 def test_exchanged_axes_are_refused_with_what_mends_them(pairs, line):
     wrong = exchanged(CARTESIAN, pairs)
     with pytest.raises(InputError, match=line) as told:

@@ -148,20 +148,17 @@ def test_a_missing_sample_is_bridged(performed):
     assert np.nanmax(np.abs(holed.channels["fy1"] - whole.channels["fy1"])) < 0.1
 
 
-@pytest.mark.parametrize(
-    ("setup", "said", "change", "line"),
-    [
-        (PLAIN, {"reaction": True, "sensor_axes": ["y", "x", "-z"]}, {}, "reaction = false under"),
-        (PLAIN, {}, {"pz": 1e3, "py": 1e3, "px": 1e3}, r'pz = \{from = "pz", unit = "mm"\}'),
-        (PLAIN, {}, {"gap": 1e3}, r'looks like mm \(or %\); expected gap = \{from = "gap", unit = "mm"\}'),
-        (PLAIN, {}, {"gap": -1.0},
-         r"counts how far the gripper has closed; expected gap = \{from = .gap., sign = -1"),
-        (Setup(heading=0.3), {}, {"qw": 2.0}, "a quaternion of norm .*expected a norm of 1"),
-        (PLAIN, {}, {"t": 1e3}, r't = \{from = "t", unit = "ms"\}'),
-        (PLAIN, {}, {"gap": 1e-6}, "expected a gripper that closes and opens"),
-        (PLAIN, {}, {"Fz": 0.0}, "column Fz: reads -?0 in every row; expected readings of a working sensor"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("setup", "said", "change", "line"), [
+    (PLAIN, {"reaction": True, "sensor_axes": ["y", "x", "-z"]}, {}, "reaction = false under"),
+    (PLAIN, {}, {"pz": 1e3, "py": 1e3, "px": 1e3}, r'pz = \{from = "pz", unit = "mm"\}'),
+    (PLAIN, {}, {"gap": 1e3}, r'looks like mm \(or %\); expected gap = \{from = "gap", unit = "mm"\}'),
+    (PLAIN, {}, {"gap": -1.0},
+     r"counts how far the gripper has closed; expected gap = \{from = .gap., sign = -1"),
+    (Setup(heading=0.3), {}, {"qw": 2.0}, "a quaternion of norm .*expected a norm of 1"),
+    (PLAIN, {}, {"t": 1e3}, r't = \{from = "t", unit = "ms"\}'),
+    (PLAIN, {}, {"gap": 1e-6}, "expected a gripper that closes and opens"),
+    (PLAIN, {}, {"Fz": 0.0}, "column Fz: reads -?0 in every row; expected readings of a working sensor"),
+])  # fmt: skip
 def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line):
     columns = wrist_recording(performed[0], setup)
     for name, factor in change.items():

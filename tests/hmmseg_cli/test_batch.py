@@ -80,17 +80,14 @@ def test_what_is_wrong_with_one_recording_is_one_line(lab, capfd, tmp_path):
     assert not (tmp_path / "out.json").exists()
 
 
-@pytest.mark.parametrize(
-    ("more", "said"),
-    [
-        (["--workers", "1", "--figures", "f"], "--workers, --scheduler: go with --json alone"),
-        (["--workers", "1", "--method", "qualitative"], "--workers, --scheduler: go with --json alone"),
-        (["--workers", "0"], "Invalid value for '--workers'"),
-        (["--scheduler", "nowhere"], "--scheduler nowhere: no scheduler answers there"),
-        (["--workers", "1", "--force-threshold", "0.1"], "go only with the paper's thresholds"),
-        (["--workers", "1", "--write", "labelled.txt"], "--write labelled.txt: unknown kind of file"),
-    ],
-)
+@pytest.mark.parametrize(("more", "said"), [
+    (["--workers", "1", "--figures", "f"], "--workers, --scheduler: go with --json alone"),
+    (["--workers", "1", "--method", "qualitative"], "--workers, --scheduler: go with --json alone"),
+    (["--workers", "0"], "Invalid value for '--workers'"),
+    (["--scheduler", "nowhere"], "--scheduler nowhere: no scheduler answers there"),
+    (["--workers", "1", "--force-threshold", "0.1"], "go only with the paper's thresholds"),
+    (["--workers", "1", "--write", "labelled.txt"], "--write labelled.txt: unknown kind of file"),
+])  # fmt: skip
 def test_refusals(lab, more, said, capfd, monkeypatch):
     monkeypatch.setattr("hmmseg_cli.batch.PATIENCE", 0.5)
     if "--scheduler" in more:

@@ -48,19 +48,16 @@ def test_a_cause_is_named_and_patched(logs, tmp_path):
     assert f"With it in the model the gap shrinks by {shrinks} on held-out stretches" in said
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        (["--mjcf", "robot.xml"], "--map: missing"),
-        (["--map", "map.toml"], "goes with a MuJoCo model; expected --mjcf XML"),
-        (["--candidate", "joint:a.damping"], "goes with a MuJoCo model"),
-        (["--simulator", "x.py:Y", "--mjcf", "robot.xml"], "--mjcf: does not go with --simulator"),
-        (["--simulator", f"{SWING}:Swing", "--rig", "rig.toml"], "--rig: does not go with a simulator"),
-        (["--simulator", f"{SWING}:Swing", "--effect", "viscos"], r"is no candidate; expected .*viscous"),
-        (["--simulator", f"{SWING}:Swung"], "did you mean Swing"),
-        (["--mjcf", "robot.xml", "--map", "map.toml"], "no such file"),
-    ],
-)
+@pytest.mark.parametrize(("options", "line"), [
+    (["--mjcf", "robot.xml"], "--map: missing"),
+    (["--map", "map.toml"], "goes with a MuJoCo model; expected --mjcf XML"),
+    (["--candidate", "joint:a.damping"], "goes with a MuJoCo model"),
+    (["--simulator", "x.py:Y", "--mjcf", "robot.xml"], "--mjcf: does not go with --simulator"),
+    (["--simulator", f"{SWING}:Swing", "--rig", "rig.toml"], "--rig: does not go with a simulator"),
+    (["--simulator", f"{SWING}:Swing", "--effect", "viscos"], r"is no candidate; expected .*viscous"),
+    (["--simulator", f"{SWING}:Swung"], "did you mean Swing"),
+    (["--mjcf", "robot.xml", "--map", "map.toml"], "no such file"),
+])  # fmt: skip
 def test_what_does_not_go_together_is_said(logs, capsys, options, line):
     assert main(["diagnose", *logs, *options]) == 2
     told = capsys.readouterr().err

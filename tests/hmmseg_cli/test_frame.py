@@ -53,20 +53,17 @@ def test_version_and_help(capsys):
         assert "decompose" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (["decompse"], "hmmseg: No such command 'decompse'"),
-        (["decompose"], "hmmseg decompose: Missing argument 'TASK'"),
-        (["decompose", "a", "--jsn", "b"], "hmmseg decompose: No such option: --jsn"),
-        (["decompose", "a", "b"], "hmmseg decompose: Got unexpected extra argument"),
-        (["decompose", "a", "--seed", "x"], "hmmseg decompose: Invalid value for '--seed'"),
-        (["decompose", "a", "--seed", "-1"], "hmmseg decompose: Invalid value for '--seed'"),
-        (["decompose", "a", "--json"], "hmmseg: Option '--json' requires an argument"),
-        (["--nonsense"], "hmmseg: No such option: --nonsense"),
-        (["decompose", "absent.toml"], "absent.toml: no such file; expected a TOML file"),
-    ],
-)
+@pytest.mark.parametrize(("args", "line"), [
+    (["decompse"], "hmmseg: No such command 'decompse'"),
+    (["decompose"], "hmmseg decompose: Missing argument 'TASK'"),
+    (["decompose", "a", "--jsn", "b"], "hmmseg decompose: No such option: --jsn"),
+    (["decompose", "a", "b"], "hmmseg decompose: Got unexpected extra argument"),
+    (["decompose", "a", "--seed", "x"], "hmmseg decompose: Invalid value for '--seed'"),
+    (["decompose", "a", "--seed", "-1"], "hmmseg decompose: Invalid value for '--seed'"),
+    (["decompose", "a", "--json"], "hmmseg: Option '--json' requires an argument"),
+    (["--nonsense"], "hmmseg: No such option: --nonsense"),
+    (["decompose", "absent.toml"], "absent.toml: no such file; expected a TOML file"),
+])  # fmt: skip
 def test_usage_at_fault(capsys, args, line):
     assert frame.main(args) == 2
     out, err = capsys.readouterr()
@@ -125,17 +122,14 @@ def test_a_process_with_a_bug_shows_its_traceback(task):
     assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"json": "{}/trial.csv"}, "--json .*trial.csv: would be written over, .*; expected a .json file"),
-        ({"json": "{}"}, "--json .*: is a folder; expected a file"),
-        ({"json": "{}/file/a.json"}, "--json .*file is not a folder; expected a folder"),
-        ({"report": "{}/a.json"}, "--report .*a.json: unknown kind of file; expected .html or .htm"),
-        ({"figures": "{}/file"}, "--figures .*file is not a folder; expected a folder"),
-        ({"figures": "{}/file/below"}, "--figures .*file is not a folder"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({"json": "{}/trial.csv"}, "--json .*trial.csv: would be written over, .*; expected a .json file"),
+    ({"json": "{}"}, "--json .*: is a folder; expected a file"),
+    ({"json": "{}/file/a.json"}, "--json .*file is not a folder; expected a folder"),
+    ({"report": "{}/a.json"}, "--report .*a.json: unknown kind of file; expected .html or .htm"),
+    ({"figures": "{}/file"}, "--figures .*file is not a folder; expected a folder"),
+    ({"figures": "{}/file/below"}, "--figures .*file is not a folder"),
+])  # fmt: skip
 def test_destinations_are_checked_beforehand(tmp_path, arguments, message):
     (tmp_path / "file").write_text("")
     given = {name: value.format(tmp_path) for name, value in arguments.items()}

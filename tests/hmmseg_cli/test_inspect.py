@@ -108,26 +108,23 @@ def test_nothing_is_proposed_where_nothing_is_needed(case):
     assert (found.mapping, found.remarks) == ({}, ())
 
 
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (["time", "L_pos_x", "L_pos_y", "L_fx", "L_fy", "R_pos_x", "R_pos_y", "R_fx", "R_fy"],
-         {"t": "time", "x1": "L_pos_x", "y1": "L_pos_y", "fx1": "L_fx", "fy1": "L_fy", "x2": "R_pos_x",
-          "y2": "R_pos_y", "fx2": "R_fx", "fy2": "R_fy"}),
-        (["timestamp", "finger1.tip.x", "finger1.tip.z", "finger1.force.x", "finger1.force.z",
-          "finger2.tip.x", "finger2.tip.z", "finger2.force.x", "finger2.force.z", "finger1.torque.x"],
-         {"t": "timestamp", "x1": "finger1.tip.x", "y1": "finger1.tip.z", "fx1": "finger1.force.x",
-          "fy1": "finger1.force.z", "x2": "finger2.tip.x", "y2": "finger2.tip.z", "fx2": "finger2.force.x",
-          "fy2": "finger2.force.z"}),
-        (["t", "right_joint_1", "right_joint_2", "left_joint_1", "left_joint_2", "F1x", "F1y", "F2x", "F2y"],
-         {"q21": "right_joint_1", "q22": "right_joint_2", "q11": "left_joint_1", "q12": "left_joint_2",
-          "fx1": "F1x", "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
-        (["t", "joint1_1", "joint1_2", "joint2_1", "joint2_2", "F1x", "F1y", "F2x", "F2y"],
-         {"q11": "joint1_1", "q12": "joint1_2", "q21": "joint2_1", "q22": "joint2_2", "fx1": "F1x",
-          "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
-        (["t", "temperature", "pressure"], {}),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("names", "expected"), [
+    (["time", "L_pos_x", "L_pos_y", "L_fx", "L_fy", "R_pos_x", "R_pos_y", "R_fx", "R_fy"],
+     {"t": "time", "x1": "L_pos_x", "y1": "L_pos_y", "fx1": "L_fx", "fy1": "L_fy", "x2": "R_pos_x",
+      "y2": "R_pos_y", "fx2": "R_fx", "fy2": "R_fy"}),
+    (["timestamp", "finger1.tip.x", "finger1.tip.z", "finger1.force.x", "finger1.force.z",
+      "finger2.tip.x", "finger2.tip.z", "finger2.force.x", "finger2.force.z", "finger1.torque.x"],
+     {"t": "timestamp", "x1": "finger1.tip.x", "y1": "finger1.tip.z", "fx1": "finger1.force.x",
+      "fy1": "finger1.force.z", "x2": "finger2.tip.x", "y2": "finger2.tip.z", "fx2": "finger2.force.x",
+      "fy2": "finger2.force.z"}),
+    (["t", "right_joint_1", "right_joint_2", "left_joint_1", "left_joint_2", "F1x", "F1y", "F2x", "F2y"],
+     {"q21": "right_joint_1", "q22": "right_joint_2", "q11": "left_joint_1", "q12": "left_joint_2",
+      "fx1": "F1x", "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
+    (["t", "joint1_1", "joint1_2", "joint2_1", "joint2_2", "F1x", "F1y", "F2x", "F2y"],
+     {"q11": "joint1_1", "q12": "joint1_2", "q21": "joint2_1", "q22": "joint2_2", "fx1": "F1x",
+      "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
+    (["t", "temperature", "pressure"], {}),
+])  # fmt: skip
 def test_names_taken_apart(names, expected):
     table = make_table("a", {name: np.zeros(9) for name in names})
     assert {ours: fields["from"] for ours, fields in propose(table).items()} == expected
@@ -164,14 +161,11 @@ def test_a_rate_that_is_not_the_files_is_said(tmp_path):
     assert any("is sampled at 20 Hz, but rate = 50 in rig.toml" in each for each in trial.warnings)
 
 
-@pytest.mark.parametrize(
-    ("rig", "line"),
-    [
-        ("[columns]\nx1 = 'a'\n", "--write .*rig.toml: already has .columns.; expected a rig without it"),
-        ("rate = -1", "rig.toml: key rate: "),
-        ("rate = ", "rig.toml: not valid TOML"),
-    ],
-)
+@pytest.mark.parametrize(("rig", "line"), [
+    ("[columns]\nx1 = 'a'\n", "--write .*rig.toml: already has .columns.; expected a rig without it"),
+    ("rate = -1", "rig.toml: key rate: "),
+    ("rate = ", "rig.toml: not valid TOML"),
+])  # fmt: skip
 def test_a_rig_that_cannot_take_the_mapping_stays_as_it_was(tmp_path, capsys, rig, line):
     ours = dict(CARTESIAN)
     pd.DataFrame({"time": ours.pop("t"), **ours}).to_csv(tmp_path / "a.csv", index=False)

@@ -41,21 +41,18 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
     assert json.loads((tmp_path / "out.json").read_text())["segments"] == lines[-1]["segments"]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda rows: [rows[0].replace("fx1", "fz1"), *rows[1:]], "column fx1: missing"),
-        (lambda rows: [*rows[:5], rows[5].replace(",", ",x", 1), *rows[6:]], "row 6, column q11: 'x"),
-        (lambda rows: [*rows[:5], "1,2,3", *rows[6:]], "row 6: has 3 cells; expected 13"),
-        (lambda rows: [*rows[:5], "," + rows[5].split(",", 1)[1], *rows[6:]], "row 6, column t: missing"),
-        (lambda rows: [], "standard input: is empty"),
-        (lambda rows: rows[:1], "the stream: has no rows; expected a row for every sample"),
-        (
-            lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
-            "row 6, column fy2: 1e+300 is no",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda rows: [rows[0].replace("fx1", "fz1"), *rows[1:]], "column fx1: missing"),
+    (lambda rows: [*rows[:5], rows[5].replace(",", ",x", 1), *rows[6:]], "row 6, column q11: 'x"),
+    (lambda rows: [*rows[:5], "1,2,3", *rows[6:]], "row 6: has 3 cells; expected 13"),
+    (lambda rows: [*rows[:5], "," + rows[5].split(",", 1)[1], *rows[6:]], "row 6, column t: missing"),
+    (lambda rows: [], "standard input: is empty"),
+    (lambda rows: rows[:1], "the stream: has no rows; expected a row for every sample"),
+    (
+        lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
+        "row 6, column fy2: 1e+300 is no",
+    ),
+])  # fmt: skip
 def test_bad_input_gets_one_line(run, change, message):
     code, _, err = run(change(ROWS[:10]))
     assert code == 2

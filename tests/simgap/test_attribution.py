@@ -168,13 +168,10 @@ def test_healthy_recordings_are_taken_until_the_answer_is_clear():
     assert rare.resolution == pytest.approx(1 / 20) and rare.p_value == pytest.approx(np.exp(-5))
     assert detected(50.0, healthy()).resolution == pytest.approx(1 / 2)  # the first leaves no doubt
     assert detected(50.0, [20.0] * 6).resolution == pytest.approx(1 / 7)  # as large ones do
-
-
-def test_healthy_recordings_tell_by_how_much_the_bayes_factor_is_off():
-    healthy = [9.0, 10.0, 11.0, 10.0]
-    expected = np.log((np.exp(healthy).sum() + 1) / 5)
-    assert detected(14.0, healthy).p_value == pytest.approx(np.exp(expected - 14.0))
-    assert detected(10.5, healthy).p_value >= 2 / 5
+    others = [9.0, 10.0, 11.0, 10.0]  # they tell by how much the Bayes factor is off
+    expected = np.log((np.exp(others).sum() + 1) / 5)
+    assert detected(14.0, others).p_value == pytest.approx(np.exp(expected - 14.0))
+    assert detected(10.5, others).p_value >= 2 / 5
 
 
 def test_of_one_effects_forms_one_acts():
@@ -225,15 +222,12 @@ def test_rounding_makes_no_probability_larger_than_one():
     assert acting([one("b", w) for w in each], 0.0, 1.0)["b"] == 1.0
 
 
-def test_two_effects_and_a_healthy_recording():
+def test_two_effects_a_healthy_recording_and_effects_that_nothing_tells_apart():
     assert attribute(gap_of({0: 3.0, 2: 3.0}), heldout=False).causes == ("a", "c")
     healthy = attribute(gap_of({}, seed=5))
     assert healthy.verdict == "none" and healthy.where == () and healthy.how_far is None
-
-
-def test_effects_that_nothing_tells_apart_are_a_set():
-    found = attribute(gap_of({0: 3.0}, same=True), heldout=False)
-    assert found.verdict == "set" and {*found.causes, *found.indistinguishable} == {"a", "b"}
+    alike = attribute(gap_of({0: 3.0}, same=True), heldout=False)
+    assert alike.verdict == "set" and {*alike.causes, *alike.indistinguishable} == {"a", "b"}
 
 
 def test_what_no_effect_explains_is_unknown_and_told_where():
@@ -246,33 +240,23 @@ def test_what_no_effect_explains_is_unknown_and_told_where():
     assert leading and {(c.channel, c.part) for c in leading} == {("c0", "p1")}
 
 
-def test_a_gap_below_what_matters_is_none_and_told_with_its_size():
-    gap = gap_of({1: 3.0})
-    n = gap.residual.size
-    small = attribute(replace(gap, tolerance=np.full(n, 10.0)), heldout=False)
-    assert small.verdict == "none" and small.small_gap is not None and 0 < small.small_gap.size < 1
-    assert attribute(replace(gap, tolerance=np.full(n, 0.05)), heldout=False).verdict == "named"
-
-
-def test_no_healthy_recordings_are_searched_for_a_gap_that_does_not_matter():
+def test_a_gap_below_what_matters_is_none_told_with_its_size_and_asks_for_no_healthy_recordings():
     gap, taken = gap_of({1: 3.0}), []
 
     def healthy():
         taken.append(0)
         yield 0.0
 
-    for tolerance, number in ((10.0, 0), (0.05, 1)):
-        few = replace(gap, tolerance=np.full(gap.residual.size, tolerance))
-        found = attribute(few, healthy(), heldout=False)
-        assert len(taken) == number and found.detection.resolution == number / 2
-
-
-def test_a_gap_that_nuisances_hide_where_they_never_are_is_not_small():
-    gap = gap_of({1: 3.0})
-    gap = replace(gap, tolerance=np.full(gap.residual.size, 10.0))
-    hidden = replace(gap, residual=gap.residual + 4.0 * gap.nuisance[:, 0])
-    assert attribute(gap, heldout=False).verdict == "none"
+    n = gap.residual.size
+    tolerant = replace(gap, tolerance=np.full(n, 10.0))
+    small = attribute(tolerant, healthy(), heldout=False)
+    assert small.verdict == "none" and small.small_gap is not None and 0 < small.small_gap.size < 1
+    assert not taken and small.detection.resolution == 0
+    # What nuisances hide where they never are is not small.
+    hidden = replace(tolerant, residual=gap.residual + 4.0 * gap.nuisance[:, 0])
     assert attribute(hidden, heldout=False).verdict != "none"
+    found = attribute(replace(gap, tolerance=np.full(n, 0.05)), healthy(), heldout=False)
+    assert found.verdict == "named" and len(taken) == 1 and found.detection.resolution == 0.5
 
 
 def test_a_prior_that_tolerates_is_a_prior_and_leaves_what_matters_as_likely():
@@ -476,14 +460,11 @@ def one(name: str, weight: float, known: float = 1.0, causes: tuple[str, ...] | 
     return Explanation(effects, weight, effects if causes is None else causes, known)
 
 
-def test_probabilities_are_the_weights_where_every_set_is_known():
+def test_probabilities_are_the_weights_and_what_a_set_is_not_known_to_explain_is_unknown():
     found = probabilities([one("a", 0.7), one("ab", 0.2), one("", 0.1)], SURE)
     assert sum(found.values()) == pytest.approx(1.0)
     assert found["a"] == pytest.approx(0.7) and found["a+b"] == pytest.approx(0.2)
     assert found["unknown"] == pytest.approx(0.1) and found["none"] < 1e-6
-
-
-def test_what_a_set_is_not_known_to_explain_is_unknown():
     sets = [one("a", 0.8, 0.25), one("b", 0.2, 0.5)]
     assert probabilities(sets, SURE)["unknown"] == pytest.approx(0.8 * 0.75 + 0.2 * 0.5)
     assert conclude(sets, SURE).verdict == "unknown"
@@ -537,26 +518,23 @@ def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
 B_IN_TWO = [one("a", 0.4), one("bx", 0.3, causes=("b",)), one("by", 0.3, causes=("b",))]
 
 
-@pytest.mark.parametrize(
-    ("sets", "more", "causes", "others"),
-    [
-        # Sets of the same causes count together; what was chosen, or forced, is named all the same.
-        (B_IN_TWO, {}, ("b",), ("a",)),
-        (B_IN_TWO, {"chosen": ("a",)}, ("a",), ()),
-        ([one("ab", 1.0, 0.0)], {"p_value": 0.9, "forced": ("b", "a")}, ("a", "b"), ()),
-        # What takes a cause's place is told down to one in twenty: an effect too small to be a cause is none
-        # beside an alternative either, and a larger set is no alternative.
-        ([one("a", 19 / 20), one("b", 1 / 20)], {}, ("a",), ("b",)),
-        ([one("a", 21 / 22), one("b", 1 / 22)], {}, ("a",), ()),
-        ([one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))], {}, ("a",), ("b",)),
-        ([one("a", 0.5), one("bc", 0.5)], {}, ("a",), ()),
-        # What a set can do without is no cause, unless that is ruled out or leaves too much.
-        ([one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)], {}, ("a",), ()),
-        ([one("ab", 0.96), one("a", 0.03)], {}, ("a", "b"), ()),
-        ([one("ab", 0.6), one("a", 0.3, 0.01)], {}, ("a", "b"), ()),
-        ([one("ab", 0.6), one("c", 0.3)], {}, ("a", "b"), ("c",)),  # not a part of the set but an alternative
-    ],
-)
+@pytest.mark.parametrize(("sets", "more", "causes", "others"), [
+    # Sets of the same causes count together; what was chosen, or forced, is named all the same.
+    (B_IN_TWO, {}, ("b",), ("a",)),
+    (B_IN_TWO, {"chosen": ("a",)}, ("a",), ()),
+    ([one("ab", 1.0, 0.0)], {"p_value": 0.9, "forced": ("b", "a")}, ("a", "b"), ()),
+    # What takes a cause's place is told down to one in twenty: an effect too small to be a cause is none
+    # beside an alternative either, and a larger set is no alternative.
+    ([one("a", 19 / 20), one("b", 1 / 20)], {}, ("a",), ("b",)),
+    ([one("a", 21 / 22), one("b", 1 / 22)], {}, ("a",), ()),
+    ([one("as", 0.6, causes=("a",)), one("bs", 0.4, causes=("b",))], {}, ("a",), ("b",)),
+    ([one("a", 0.5), one("bc", 0.5)], {}, ("a",), ()),
+    # What a set can do without is no cause, unless that is ruled out or leaves too much.
+    ([one("ab", 0.6), one("a", 0.3), one("", 0.1, 0.0)], {}, ("a",), ()),
+    ([one("ab", 0.96), one("a", 0.03)], {}, ("a", "b"), ()),
+    ([one("ab", 0.6), one("a", 0.3, 0.01)], {}, ("a", "b"), ()),
+    ([one("ab", 0.6), one("c", 0.3)], {}, ("a", "b"), ("c",)),  # not a part of the set but an alternative
+])  # fmt: skip
 def test_causes_and_what_takes_their_place(sets, more, causes, others):
     told = conclude(sets, **{"p_value": SURE} | more)
     assert (told.causes, told.indistinguishable) == (causes, others)

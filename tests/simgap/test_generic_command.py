@@ -53,15 +53,12 @@ def test_a_plain_task_without_simulated_trials_is_refused(folder, capsys):
     assert "--against SIM" in line and line.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("more", "line"),
-    [
-        (["--actual", "actual.toml"], "does not go with --against"),
-        (["--healthy", "sim_04.csv"], "does not go with --against"),
-        (["--effect", "grip_slip"], "needs the virtual model"),
-        (["--against", "real_00.csv"], "the same trial as"),
-    ],
-)
+@pytest.mark.parametrize(("more", "line"), [
+    (["--actual", "actual.toml"], "does not go with --against"),
+    (["--healthy", "sim_04.csv"], "does not go with --against"),
+    (["--effect", "grip_slip"], "needs the virtual model"),
+    (["--against", "real_00.csv"], "the same trial as"),
+])  # fmt: skip
 def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypatch, more, line):
     monkeypatch.chdir(folder)
     (folder / "actual.toml").write_text("")

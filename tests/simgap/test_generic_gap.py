@@ -182,20 +182,12 @@ def test_one_real_trial_says_that_it_is_weaker():
     assert "force_bias" in found.leading
 
 
-def test_one_trial_of_each_kind_is_refused():
+def test_trials_that_do_not_go_together_are_refused():
     real, sim, boundaries = made(4)
     with pytest.raises(InputError, match="one real and one simulated"):
         align(real[:1], sim[:1], TASK, boundaries=boundaries)
-
-
-def test_boundaries_must_fit_the_task():
-    real, sim, boundaries = made(4)
     with pytest.raises(InputError, match="2 increasing times"):
         align(real, sim, TASK, boundaries=boundaries | {real[0].file: np.array([1.0])})
-
-
-def test_a_channel_that_a_trial_lacks_is_refused():
-    real, sim, _ = made(4)
     with pytest.raises(InputError, match=r"sim_00.csv: column fc: missing|column fc: missing"):
         align(real, sim, SequenceTask(TASK.sequence, ("fa", "fc")))
 

@@ -158,14 +158,11 @@ def test_a_diagnosis_names_what_stands_beside(tmp_path):
     assert diagnosed(path) == {}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["nowhere.json"], "nowhere.json: no such file"),
-        (["--effect", "gravity"], "effect gravity: cannot be felt in a played world"),
-        (["--rig", "nowhere.toml"], "nowhere.toml: no such file"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "line"), [
+    (["nowhere.json"], "nowhere.json: no such file"),
+    (["--effect", "gravity"], "effect gravity: cannot be felt in a played world"),
+    (["--rig", "nowhere.toml"], "nowhere.toml: no such file"),
+])  # fmt: skip
 def test_bad_input_is_told_in_one_line(arguments, line, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["play", *arguments, "--no-open"]) == 2

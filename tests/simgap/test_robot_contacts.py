@@ -37,14 +37,11 @@ def tumbling(name: str = "log.csv") -> Recording:
     return Recording(name, t, {"x": 0.3 * t, "y": 0.1 + 0 * t, "z": 1 - 4.9 * t**2} | turn)
 
 
-@pytest.mark.parametrize(
-    ("name", "theta"),
-    [
-        ("pose:cube.lag", {"delay": 0.02}),
-        ("pose:cube.turned", {"about_x": 0.03, "about_y": -0.02, "about_z": 0.05}),
-        ("pose:cube.offset", {"x": 0.01, "y": 0.0, "z": -0.02}),
-    ],
-)
+@pytest.mark.parametrize(("name", "theta"), [
+    ("pose:cube.lag", {"delay": 0.02}),
+    ("pose:cube.turned", {"about_x": 0.03, "about_y": -0.02, "about_z": 0.05}),
+    ("pose:cube.offset", {"x": 0.01, "y": 0.0, "z": -0.02}),
+])  # fmt: skip
 def test_what_a_pose_is_read_through_is_undone(name, theta):
     log = tumbling()
     effects = {e.name: e for e in readouts.candidates(Setting(Posed(), [log]))}

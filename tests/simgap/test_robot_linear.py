@@ -22,10 +22,10 @@ from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
 
-def composed(recordings, length: float = 0.4) -> Composed:
-    simulator = checked(Swing(), "Swing")
+def composed(recordings, robot=Swing) -> Composed:
+    simulator = checked(robot(), robot.__name__)
     effects = candidates(Setting(simulator, recordings))
-    return Composed.of(simulator, recordings, effects, noises(simulator, recordings), length)
+    return Composed.of(simulator, recordings, effects, noises(simulator, recordings))
 
 
 def whitened(model: Composed, point=None, effects=()):
@@ -84,17 +84,11 @@ def test_whitened_residuals_of_a_true_model_are_white():
     assert abs(np.mean((residual[1:] * residual[:-1])[inside])) < 0.06
 
 
-@pytest.mark.parametrize(
-    ("effect", "values"),
-    [
-        ("viscous", {"viscous": 4e-4}),
-        ("gravity_torque", {"gravity_torque": 0.505}),
-        ("readout:angle.bias", {"bias": 2e-3}),
-        ("readout:angle.lag", {"delay": 1e-3}),
-        ("command.delay", {"delay": 2e-3}),
-        ("readout:angle.gain", {"gain": 2e-3}),
-    ],
-)
+@pytest.mark.parametrize(("effect", "values"), [
+    ("viscous", {"viscous": 4e-4}), ("gravity_torque", {"gravity_torque": 0.505}),
+    ("readout:angle.bias", {"bias": 2e-3}), ("readout:angle.lag", {"delay": 1e-3}),
+    ("command.delay", {"delay": 2e-3}), ("readout:angle.gain", {"gain": 2e-3}),
+])  # fmt: skip
 def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
     """A small effect, starts read through it too, changes the residual by its Jacobian times it."""
     recording = log(3, noise=1e-9)
@@ -193,9 +187,7 @@ def test_numerics_are_exact_at_a_point_and_constant_about_it():
             found = super().simulate(parameters, recording, start)["angle"]
             return {"angle": found * (1 + 0.01 * parameters["step"])}
 
-    simulator, logs = checked(Stepped(), "here"), [log(0, seconds=1.0)]
-    effects = candidates(Setting(simulator, logs))
-    made = Composed.of(simulator, logs, effects, noises(simulator, logs))
+    made = composed([log(0, seconds=1.0)], Stepped)
     runs.clear()
     point = {"step": {"step": 0.5}}
     linear = linearise(made, point, ["viscous", "inertia"])
@@ -272,8 +264,5 @@ def test_a_model_that_explodes_at_a_candidate_is_said_and_the_others_go_on():
             found = super().simulate(parameters, recording, start)
             return found if parameters["charge"] == 0 else {n: v * np.inf for n, v in found.items()}
 
-    simulator, logs = checked(Explosive(), "Explosive"), [log(0, seconds=2.0)]
-    effects = candidates(Setting(simulator, logs))
-    composed = Composed.of(simulator, logs, effects, noises(simulator, logs))
-    linear = linearise(composed, {}, ["charge", "viscous"])
+    linear = linearise(composed([log(0, seconds=2.0)], Explosive), {}, ["charge", "viscous"])
     assert linear.diverged == ("charge",) and set(linear.moved) == {"viscous"}

@@ -47,15 +47,12 @@ def test_nothing_moves_more_often_than_stated():
     assert moved <= 10  # of 400, 1 % of runs; more than 10 once in 300
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        '{"date": 3}',
-        '"text"',
-        '{"date": "2026-01-01", "parameters": {"a": {"mean": "1"}}}',
-        '{"date": "2026-01-01", "parameters": {"a": {"mean": 1, "interval_90": 2}}}',
-    ],
-)
+@pytest.mark.parametrize("line", [
+    '{"date": 3}',
+    '"text"',
+    '{"date": "2026-01-01", "parameters": {"a": {"mean": "1"}}}',
+    '{"date": "2026-01-01", "parameters": {"a": {"mean": 1, "interval_90": 2}}}',
+])  # fmt: skip
 def test_a_history_that_is_none_names_its_line(tmp_path, line):
     file = tmp_path / "h.jsonl"
     assert history(file) == []
@@ -121,14 +118,11 @@ def test_a_model_that_flies_off_is_one_line():
         np.linalg.cholesky(-np.eye(2))
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        (["--history", "h.jsonl"], "--history h.jsonl: goes with a model of a robot; expected --mjcf XML"),
-        (["--simulator", "x.py:Y", "--history", "h.txt"], "unknown kind of file; expected .jsonl"),
-        (["--simulator", "x.py:Y", "--rerun", "a.rrd"], "--rerun: needs rerun-sdk; expected pip install"),
-    ],
-)
+@pytest.mark.parametrize(("options", "line"), [
+    (["--history", "h.jsonl"], "--history h.jsonl: goes with a model of a robot; expected --mjcf XML"),
+    (["--simulator", "x.py:Y", "--history", "h.txt"], "unknown kind of file; expected .jsonl"),
+    (["--simulator", "x.py:Y", "--rerun", "a.rrd"], "--rerun: needs rerun-sdk; expected pip install"),
+])  # fmt: skip
 def test_options_that_cannot_be_are_said_at_once(tmp_path, capsys, options, line, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "rerun", None)

@@ -54,28 +54,25 @@ def test_a_run_that_diverges_is_none(file):
     assert found[0] is not None and found[0]["y"].tolist() == [2.0, 2.0, 2.0] and found[1] is None
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "line"),
-    [
-        ("Robt", GOOD, r"has no Robt; expected one of .*did you mean Robot\?"),
-        ("number", GOOD, "has no mapping 'parameters'; expected parameters, channels and simulate"),
-        ("Robot", "x = 1\nraise KeyError('x')", r"robot\.py, line 2: KeyError: 'x'; expected a file"),
-        ("Robot", "import sys\nsys.exit(0)", r"robot\.py, line 2: SystemExit: 0; expected a file that runs"),
-        ("Robot", "def f(:\n", r"robot\.py, line 1: SyntaxError: "),
-        ("Robot", GOOD.replace("1.0,", "10**400,"), "parameter slope: int too large"),
-        ("Robot", GOOD.replace("class Robot:", "class Robot:\n    by_log = 5"), "AttributeError"),
-        ("Robot", GOOD + "Robot.parameters = property(lambda self: 1 / 0)", r"line 18: ZeroDivisionError"),
-        ("Robot", GOOD.replace('"sd": 0.1', '"sd": 0.0'), "slope: nominal 1.0 and sd 0.0: expected"),
-        ("Robot", GOOD.replace('"low": 0.0', '"low": 2.0'), "parameter slope: nominal 1.0 lies outside of"),
-        ("Robot", GOOD.replace('"sd": 0.1', '"std": 0.1'), r"slope: std: unknown key; .*did you mean sd\?"),
-        ("Robot", GOOD.replace("position", "place"), "channel y: kind 'place': expected one of position,"),
-        ("Robot", GOOD.replace("1e-3", "-1e-3"), "channel y: noise -0.001: expected above 0"),
-        ("Robot", GOOD.replace("position", "command"), "no channel to compare"),
-        ("Robot", GOOD.replace("class Robot:", "class Robot:\n    numerics = {'slop'}"), "no parameter slop"),
-        ("Robot", GOOD.replace("class Robot:", "class Robot:\n    window = 0"), "window: 0; expected"),
-        ("Robot", GOOD.replace("def simulate", "def run"), "cannot be run; expected a method simulate"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "text", "line"), [
+    ("Robt", GOOD, r"has no Robt; expected one of .*did you mean Robot\?"),
+    ("number", GOOD, "has no mapping 'parameters'; expected parameters, channels and simulate"),
+    ("Robot", "x = 1\nraise KeyError('x')", r"robot\.py, line 2: KeyError: 'x'; expected a file"),
+    ("Robot", "import sys\nsys.exit(0)", r"robot\.py, line 2: SystemExit: 0; expected a file that runs"),
+    ("Robot", "def f(:\n", r"robot\.py, line 1: SyntaxError: "),
+    ("Robot", GOOD.replace("1.0,", "10**400,"), "parameter slope: int too large"),
+    ("Robot", GOOD.replace("class Robot:", "class Robot:\n    by_log = 5"), "AttributeError"),
+    ("Robot", GOOD + "Robot.parameters = property(lambda self: 1 / 0)", r"line 18: ZeroDivisionError"),
+    ("Robot", GOOD.replace('"sd": 0.1', '"sd": 0.0'), "slope: nominal 1.0 and sd 0.0: expected"),
+    ("Robot", GOOD.replace('"low": 0.0', '"low": 2.0'), "parameter slope: nominal 1.0 lies outside of"),
+    ("Robot", GOOD.replace('"sd": 0.1', '"std": 0.1'), r"slope: std: unknown key; .*did you mean sd\?"),
+    ("Robot", GOOD.replace("position", "place"), "channel y: kind 'place': expected one of position,"),
+    ("Robot", GOOD.replace("1e-3", "-1e-3"), "channel y: noise -0.001: expected above 0"),
+    ("Robot", GOOD.replace("position", "command"), "no channel to compare"),
+    ("Robot", GOOD.replace("class Robot:", "class Robot:\n    numerics = {'slop'}"), "no parameter slop"),
+    ("Robot", GOOD.replace("class Robot:", "class Robot:\n    window = 0"), "window: 0; expected"),
+    ("Robot", GOOD.replace("def simulate", "def run"), "cannot be run; expected a method simulate"),
+])  # fmt: skip
 def test_what_is_wrong_is_said_in_a_line(file, name, text, line):
     with pytest.raises(InputError, match=line):
         load_simulator(f"{file(text)}:{name}")
@@ -92,26 +89,23 @@ run.parameters, run.channels, run.timeout = parameters, channels, 0.5
 """
 
 
-@pytest.mark.parametrize(
-    ("code", "line"),
-    [
-        ("raise ValueError('no\\nsuch motor')", r"robot\.py, line 7: ValueError: no such motor$"),
-        ("sys.exit(0)", r"robot\.py, line 7: SystemExit: 0"),
-        ("return np.linalg.inv(np.zeros((2, 2)))", r"robot\.py, line 7: LinAlgError"),
-        ("parameters['slop']", r"robot\.py, line 7: KeyError: 'slop'"),
-        ("recording.t[0] = 7", r"robot\.py, line 7: ValueError: assignment destination is read-only"),
-        ("return None", r"robot\.py, line 6: gave None; expected a dict of channels"),
-        ("return {}", r"robot\.py, line 6: gave no channel 'y'; expected y"),
-        ("return {'y': recording.t[1:]}", r"line 6: channel y: gave an array \(2,\) of float64; "),
-        ("return {'y': 1.0}", r"channel y: gave float '1.0'; expected 3 numbers"),
-        ("return {'y': None}", r"channel y: gave None; expected 3 numbers"),
-        ("return {'y': ['a', 'b', 'c']}", r"channel y: gave list of 3; expected real numbers"),
-        ("return {'y': [1, None, 10**400]}", r"channel y: gave list of 3; expected real numbers"),
-        ("return {'y': recording.t * 1j}", r"of complex128; expected real numbers"),
-        ("return {'y': [[1], [2, 3], 4]}", r"robot\.py.*: ValueError"),
-        ("while True: time.sleep(0.01)", r"robot\.py, line 7: took more than 0.5 s; expected a run"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("code", "line"), [
+    ("raise ValueError('no\\nsuch motor')", r"robot\.py, line 7: ValueError: no such motor$"),
+    ("sys.exit(0)", r"robot\.py, line 7: SystemExit: 0"),
+    ("return np.linalg.inv(np.zeros((2, 2)))", r"robot\.py, line 7: LinAlgError"),
+    ("parameters['slop']", r"robot\.py, line 7: KeyError: 'slop'"),
+    ("recording.t[0] = 7", r"robot\.py, line 7: ValueError: assignment destination is read-only"),
+    ("return None", r"robot\.py, line 6: gave None; expected a dict of channels"),
+    ("return {}", r"robot\.py, line 6: gave no channel 'y'; expected y"),
+    ("return {'y': recording.t[1:]}", r"line 6: channel y: gave an array \(2,\) of float64; "),
+    ("return {'y': 1.0}", r"channel y: gave float '1.0'; expected 3 numbers"),
+    ("return {'y': None}", r"channel y: gave None; expected 3 numbers"),
+    ("return {'y': ['a', 'b', 'c']}", r"channel y: gave list of 3; expected real numbers"),
+    ("return {'y': [1, None, 10**400]}", r"channel y: gave list of 3; expected real numbers"),
+    ("return {'y': recording.t * 1j}", r"of complex128; expected real numbers"),
+    ("return {'y': [[1], [2, 3], 4]}", r"robot\.py.*: ValueError"),
+    ("while True: time.sleep(0.01)", r"robot\.py, line 7: took more than 0.5 s; expected a run"),
+])  # fmt: skip
 def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, line):
     simulator = load_simulator(f"{file(RUN % code)}:run")
     log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
@@ -120,18 +114,15 @@ def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, 
     assert "\n" not in str(caught.value) and log.t[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("name", "code", "line"),
-    [
-        ("simulate_many", "return []", "gave 0 runs; expected 1, one for each job"),
-        ("simulate_many", "return [{'y': [1]}]", "channel y: gave list of 1; expected 3 numbers"),
-        ("simulate_many", "return 3", "TypeError"),
-        ("state_at", "return {'y': 1.0}", r"expected \{state: \(value, standard deviation\)\}"),
-        ("state_at", "return {'y': (float('nan'), 1.0)}", "state y: nan with standard dev"),
-        ("contacts", "return None", r"gave None; expected times \[s\] in one row"),
-        ("contacts", "exit(3)", "line 10: SystemExit: 3"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "code", "line"), [
+    ("simulate_many", "return []", "gave 0 runs; expected 1, one for each job"),
+    ("simulate_many", "return [{'y': [1]}]", "channel y: gave list of 1; expected 3 numbers"),
+    ("simulate_many", "return 3", "TypeError"),
+    ("state_at", "return {'y': 1.0}", r"expected \{state: \(value, standard deviation\)\}"),
+    ("state_at", "return {'y': (float('nan'), 1.0)}", "state y: nan with standard dev"),
+    ("contacts", "return None", r"gave None; expected times \[s\] in one row"),
+    ("contacts", "exit(3)", "line 10: SystemExit: 3"),
+])  # fmt: skip
 def test_what_else_a_simulator_offers_is_checked_alike(file, name, code, line):
     text = RUN % "return {'y': recording.t}" + f"def more(*args):\n    {code}\nrun.{name} = more\n"
     simulator = load_simulator(f"{file(text)}:run")

@@ -10,14 +10,7 @@ from hmmseg.contact.decompose import subtasks
 from simgap.world.properties import PAPER_BLOCKS
 from simgap.world.replay import replay, residual_summary, smooth
 from simgap.world.simulate import simulate_trials
-from simgap.world.virtual_model import (
-    RIGID_PAD,
-    VirtualModel,
-    physics,
-    rollout,
-    standing,
-    substeps_for,
-)
+from simgap.world.virtual_model import RIGID_PAD, VirtualModel, physics, rollout, standing, substeps_for
 
 STATES = [s.state for s in subtasks(STACK)]
 
