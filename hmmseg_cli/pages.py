@@ -274,7 +274,8 @@ def _detection(body: Body) -> str:
     if not fineness:
         return f"{text}."
     others = round(1 / fineness) - 1
-    return f"{text}. Ranks among {others} healthy ones alone could show {fineness:.2g} at least."
+    few = "one other alone could" if others == 1 else f"{others} others alone could"
+    return f"{text}. This follows from the sensors' noise: the rank among {few} show {fineness:.2g} at least."
 
 
 def _far(body: Body) -> str:

@@ -121,8 +121,6 @@ LEAST = 1e-3  # numerics: N, m; smaller properties cannot be simulated
 def blocks_of(found: Search) -> Blocks:
     """The blocks as the recordings alone show them, corrected for the best single effect.
 
-    With other blocks, repeated motions would end in the air.
-
     Raises:
         ValueError: A property is too small to be simulated.
     """

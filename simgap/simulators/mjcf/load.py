@@ -94,12 +94,12 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
     described = read_map(map_file)
     try:
         spec = mujoco.MjSpec.from_file(str(xml))
-        spec.compile()
+        plain = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {str(error).splitlines()[0]}") from None
     if not spec.actuators:
         _add_motors(spec, described.columns, str(map_file))
-    plain = spec.compile()
+        plain = spec.compile()
     if not SHORTEST <= plain.opt.timestep <= 1.0:
         raise InputError(f"--mjcf {xml}: option timestep", f"found {plain.opt.timestep:g} s",
                          f"from {SHORTEST:g} to 1 s")  # fmt: skip
