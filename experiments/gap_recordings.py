@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     paths = {path.name: path for path in list_cases(folder)}
     cases = {name: (read_case(path), path) for name, path in sorted(paths.items())}
     first = next(iter(cases.values()))
-    summary(*first, False, False)  # compiles
+    summary(*first, False)  # compiles
     rows = []
     for name, (case, path) in cases.items():
         label = labels.get(name, {})
