@@ -274,8 +274,8 @@ def _detection(body: Body) -> str:
     if not fineness:
         return f"{text}."
     others = round(1 / fineness) - 1
-    few = "one other alone could" if others == 1 else f"{others} others alone could"
-    return f"{text}. This follows from the sensors' noise: the rank among {few} show {fineness:.2g} at least."
+    few = "one healthy set" if others == 1 else f"{others} healthy sets"
+    return f"{text}. This follows from the sensors' noise: a rank among {few} shows {fineness:.2g} at least."
 
 
 def _far(body: Body) -> str:
