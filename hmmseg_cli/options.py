@@ -85,7 +85,8 @@ Folder = Annotated[Path, argument("FOLDER", "Where the files are written.")]
 HandKind = Annotated[Hand | None, option("--hand", None,
     "Fingertips, two-link fingers, a gripper, or none (an ordered task).")]
 Source = Annotated[File, option("--from", "FILE", "Fill in hand, rate and columns from this recording.")]
-LaidOutModel = Annotated[File, option("--mjcf", "XML", "Lay out a map.toml of this model and --from's log.")]
+LaidOutModel = Annotated[File, option("--model --mjcf", "XML",
+    "Lay out a map.toml of this model and --from's log.")]
 DemoFigures = Annotated[Path, option("--figures", "DIR", "Folder for the figures.")]
 KnownLabels = Annotated[File, option("--labels", "FILE|DIR",
     "What is known of some boundaries: a folder with NAME.json, or a .csv.")]

@@ -246,7 +246,7 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
         "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force"),
     }  # fmt: skip
     assert (found.clock.column, found.clock.size) == ("ros_stamp", 1e-9)
-    assert main(["new", str(tmp_path / "other"), "--mjcf", str(tmp_path / "robot.xml")]) == 2
+    assert main(["new", str(tmp_path / "other"), "--model", str(tmp_path / "robot.xml")]) == 2
 
 
 FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}

@@ -109,6 +109,7 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
     (MAP.replace('"Nm"', '"furlong"'), "columns.u.unit: unknown unit 'furlong'"),
     (MAP.replace('joint = "pivot"', 'joint = "pivot"\nunit = "kg"'),
      r"columns\.q\.unit: 'kg' of a position that is read in rad; expected a unit of angle"),
+    (f'{MAP}[columns.v]\nactuator = "m"', "columns: u and v are both the command of actuator m"),
     (MAP.replace('[columns.u]\nactuator = "m"\nunit = "Nm"', "[colums.u]"), "colums: unknown key"),
     *((f"{said}\n{MAP}", line) for said, line in [
         ("window = 0", "window.*greater than 0"), ("window = -1", "window.*greater than 0"),
@@ -157,6 +158,16 @@ def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, 
     log = read_back(found, tmp_path, (2.0 * t + np.pi) % (2 * np.pi) - np.pi, 0.0 * t)
     assert "jumps by whole turns" in log.warnings[0]
     np.testing.assert_allclose(log["q"], 2.0 * t, atol=1e-5)
+
+
+@pytest.mark.parametrize("moves", ['joint="pivot" gear="57.3"', 'tendon="belt"'])
+def test_goals_are_checked_in_what_the_actuator_moves(files, tmp_path, moves):
+    """A gear, or a pulley on a tendon, of which goals are as large as degrees would be."""
+    belt = '</worldbody><tendon><fixed name="belt"><joint joint="pivot" coef="57.3"/></fixed></tendon>'
+    servo = XML.replace('<motor name="m" joint="pivot"/>', f'<position name="m" {moves} kp="9"/>')
+    model = servo.replace("</worldbody>", belt)
+    found, t = load_mjcf(*files(model, MAP.replace('unit = "Nm"', 'unit = "rad"'))), np.arange(0, 2, 0.01)
+    assert not read_back(found, tmp_path, np.sin(t), np.degrees(np.sin(t))).warnings
 
 
 def test_goals_of_rates_in_degrees_are_told(files, tmp_path):
@@ -238,12 +249,15 @@ TURN = '[columns.q]\njoint = "turn"\nnoise = 1e-4\n[columns.u]\nactuator = "serv
 
 
 SET = ("joint:turn.damping", "joint:turn.armature", "body:arm.mass", "body:arm.com_x", "body:arm.payload",
-       "actuator:servo.gain", "actuator:servo.damping", "option.tilt_x", "option.timestep")  # fmt: skip
+       "actuator:servo.gain", "actuator:servo.damping", "option.tilt_x", "option.timestep",
+       "joint:nod.tie")  # fmt: skip
+TIE = """<body name="head" pos="1 0 0"><joint name="nod" axis="0 0 1"/><geom size="0.02" mass="0.1"/></body>
+  </worldbody><equality><joint joint1="nod" joint2="turn"/></equality>"""
 
 
 @pytest.mark.parametrize("name", SET)
 def test_a_patched_model_is_the_one_that_was_simulated(files, name):
-    paths = files(SERVO.replace('gravity="0 0 0"', "") % "", TURN)
+    paths = files(SERVO.replace('gravity="0 0 0"', "").replace("</worldbody>", TIE) % "", TURN)
     found = load_mjcf(*paths)
     t = np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.3 * np.sin(6 * t), "u": 0.3 * np.sin(6 * t)})
@@ -359,10 +373,12 @@ TIED = """<mujoco>
 """
 
 
-def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files):
+@pytest.mark.parametrize("tie", [0.02, 0.01])
+def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files, tie):
     """The second of two tied fingers lags by what its damping stretches the tie, in plain MuJoCo."""
     columns = '[columns.w]\njoint = "left"\n[columns.u]\nactuator = "servo"\nunit = "m"\n'
     found, model = load_mjcf(*files(TIED, columns)), mujoco.MjModel.from_xml_string(TIED)
+    model.eq_solref[:, 0] = tie
     data, t, run = mujoco.MjData(model), np.arange(0, 1, 0.01), []
     u = 0.05 * np.sin(6 * t)
     for goal in u:
@@ -373,7 +389,7 @@ def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files):
     found.effects([log])
     left, right, rate, other = run[60]
     job = Job({}, log.window(60, 90), {"w": left, "w_rate": rate})
-    _, *state = found.simulator._states([job])[0]
+    _, *state = found.simulator._states([job], (("joint:right.tie", tie),))[0]
     assert abs(left - right) > 1e-4
     np.testing.assert_allclose(state, [left, right, rate, other], atol=0.02 * abs(left - right))
 

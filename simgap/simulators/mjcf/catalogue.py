@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
-from simgap.simulators.mjcf.engine import HINGE, SLIDE, mujoco
-from simgap.simulators.mjcf.model import MjcfSimulator
+from simgap.simulators.mjcf.engine import HINGE, JOINT, SLIDE, mujoco
+from simgap.simulators.mjcf.model import MjcfSimulator, tied
 from simgap.simulators.mjcf.play import played
 from simgap.simulators.mjcf.runs import Runs
 from simgap.simulators.mjcf.setting import (
@@ -43,7 +43,6 @@ from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
 GAP = 0.02  # prior: share of a joint's reach: the usual play
-JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)
 SIZE = 0.1  # prior: share of a stated value: the usual size of its error
 GEOMS = 4  # chosen: geoms whose contact is offered, those that touch most
 
@@ -56,6 +55,7 @@ def offered(
     catalogue = _Catalogue(simulator)
     joints = catalogue.driven_joints()
     catalogue.add_joints(joints, motions)
+    catalogue.add_ties()
     catalogue.add_actuators()
     catalogue.add_bodies(joints)
     catalogue.add_options()
@@ -116,6 +116,16 @@ class _Catalogue:
             speed = replace(setting_of(self.model, f"{head}.stribeck_speed"), nominal=0.3 * rate)
             self.add(speed.name, 0.1 * rate, says, 0.03 * rate, effect=f"{head}.stribeck", setting=speed)
 
+    def add_ties(self) -> None:
+        """How softly joints follow those that equalities tie them to: MuJoCo's default is softer than any
+        linkage."""
+        m = self.model
+        for k in tied(m):
+            name, soft = name_of(m, "joint", int(m.eq_obj1id[k])), float(m.eq_solref[k, 0])
+            if name and soft > 0:
+                says = f"how softly {name} follows the joint that it is tied to"
+                self.add(f"joint:{name}.tie", SIZE * soft, says, low=2 * float(m.opt.timestep))
+
     def add_actuators(self) -> None:
         """Gain, velocity gain, fading and saturation of actuators that a log drives."""
         m = self.model
@@ -172,7 +182,7 @@ class _Catalogue:
         m, simulator, wanted, made = self.model, self.simulator, tuple(self.settings), {}
         for column, a in simulator.driven.items():
             j = int(m.actuator_trnid[a, 0])
-            alone = np.sum(np.asarray(m.actuator_trnid)[:, 0] == j) == 1
+            alone = np.sum((m.actuator_trnid[:, 0] == j) & (m.actuator_trntype == JOINT)) == 1
             if j not in joints or int(m.actuator_trntype[a]) != JOINT or not alone:
                 continue
             name = name_of(m, "joint", j)

@@ -17,6 +17,7 @@ if mujoco.__version__ == "4.0.0":
     raise InputError("--mjcf", "MuJoCo 4.0.0 has a solver bug", "another version from 3 on")
 
 FREE, SLIDE, HINGE = (int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "SLIDE", "HINGE"))
+JOINT = int(mujoco.mjtTrn.mjTRN_JOINT)  # what an actuator moves
 FULL = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
 _WARNED: Counter[str] = Counter()

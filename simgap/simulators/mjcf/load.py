@@ -15,7 +15,7 @@ from hmmseg.errors import InputError, nearest
 from hmmseg.io.units import UNITS, known_unit, unwrapped
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.catalogue import offered
-from simgap.simulators.mjcf.engine import FREE, HINGE, SLIDE, mujoco
+from simgap.simulators.mjcf.engine import FREE, HINGE, JOINT, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
 from simgap.simulators.mjcf.model import MjcfSimulator, ties
 from simgap.simulators.mjcf.setting import (
@@ -292,11 +292,12 @@ def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
         joint, per = int(model.actuator_trnid[a, 0]), "/s" if follows_rates(model, a) else ""
-        servo = per or model.actuator_biasprm[a, 1] < 0
+        servo = int(model.actuator_trntype[a]) == JOINT and (per or model.actuator_biasprm[a, 1] < 0)
         if not servo or joint not in seen or int(model.jnt_type[joint]) != HINGE:
             continue
         goal, there = log[column], seen[joint]
         angle = np.gradient(log[there], log.t) if per else log[there]
+        angle = angle * float(model.actuator_gear[a, 0])
         both = np.isfinite(goal) & np.isfinite(angle)
         if not both.any() or not np.any(angle[both]):
             continue

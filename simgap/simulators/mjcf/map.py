@@ -144,6 +144,12 @@ class Map(StrictTable):
     def _compared(cls, columns: dict[str, Mapped]) -> dict[str, Mapped]:
         if all(m.kind == "command" for m in columns.values()):
             raise ValueError("are all commands: nothing to compare; expected a joint, sensor or body")
+        known: dict[tuple[str, ...], str] = {}
+        for column, m in columns.items():
+            of = m.kind, m.thing, m.name, m.axis
+            if known.setdefault(of, column) != column:
+                found = f"{known[of]} and {column} are both the {m.kind} of {m.thing} {m.name}"
+                raise ValueError(f"{found}; expected one column of it (a second encoder is a sensor)")
         return columns
 
 

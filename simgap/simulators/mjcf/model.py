@@ -51,7 +51,8 @@ class MjcfSimulator:
     restarts: bool = True
     acts: str = ACTS
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
-    _runs: dict[str, np.ndarray] = field(default_factory=dict)
+    _logs: dict[str, Recording] = field(default_factory=dict, repr=False)
+    _ran: dict = field(default_factory=dict, repr=False)
     _touched: dict = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -92,18 +93,36 @@ class MjcfSimulator:
         """All jobs' channels with some settings changed."""
         if plays := [n for n, _ in changed if n in self.played]:
             return self.played[plays[0]](jobs, self._states(jobs), changed, self.model)
+        states = self._states(jobs, tuple(c for c in changed if c[0].endswith(TIE)))
         with changed_model(self.model, self.settings, changed):
-            return self._runs_of([j.recording for j in jobs], self._states(jobs), changed)
+            return self._runs_of([j.recording for j in jobs], states, changed)
 
-    def _states(self, jobs: Sequence[Job]) -> np.ndarray:
-        """Full physics states (jobs, size) at the windows' starts."""
-        bare = None if self._partial else self._reset()
-        return np.array([self._state(job, bare) for job in jobs])
+    def _states(self, jobs: Sequence[Job], softness: tuple[tuple[str, float], ...] = ()) -> np.ndarray:
+        """Full physics states (jobs, size) at the windows' starts, with ties as soft as `softness` says."""
+        bare, ran = None if self._partial else self._reset(), dict[str, np.ndarray]()
+        for log in {job.recording.name for job in jobs if job.start is not None} & self._logs.keys():
+            key, most = (log, softness), 2 * len(self._logs)  # as the model came, and one other
+            ran[log] = latest(self._ran, key, lambda log=log: self._run(log, softness), most)
+        return np.array([self._state(job, bare, ran.get(job.recording.name)) for job in jobs])
 
-    def _state(self, job: Job, bare: np.ndarray | None = None) -> np.ndarray:
-        """Full physics state (size,) at a window's start; `bare`: the state that columns do not determine."""
+    def _run(self, log: str, softness: tuple[tuple[str, float], ...]) -> np.ndarray:
+        """Full physics states (num_timesteps, size) along a log, as the model runs it freely."""
+        recording = self._logs[log]
+        first = self._state(Job({}, recording, None))
+        with changed_model(self.model, self.settings, softness):
+            found = free_run(self.model, self._data[0], recording, first, self.driven)
+        found[0] = first
+        found[:, 0] = 0.0
+        return np.where(np.isfinite(found), found, first)
+
+    def _state(self, job: Job, bare: np.ndarray | None = None, ran: np.ndarray | None = None) -> np.ndarray:
+        """Full physics state (size,) at a window's start.
+
+        `bare`: the state that columns do not determine; `ran`: the states of the log as the model runs it.
+        """
+        there = None if ran is None else ran[job.recording.first]
         if job.start is None or bare is None:
-            state = np.array(self._own_state(job.recording, job.start is None))
+            state = self._own_state(job.recording) if there is None or not self._partial else there.copy()
         else:
             state = bare.copy()
         if job.start is None:
@@ -113,9 +132,8 @@ class MjcfSimulator:
             state[1 + q] = job.start[column]
             state[1 + nq + v] = job.start[column + RATE]
         state = self._tied(state)
-        if job.recording.name in self._runs:  # under load a tie gives, as in the model's own run
-            ran = self._runs[job.recording.name][job.recording.first]
-            state += ran - self._tied(ran)
+        if there is not None:  # under load a tie gives, as in the model's own run
+            state += there - self._tied(there)
         for joint, columns in self.free.items():
             q, v = 1 + int(self.model.jnt_qposadr[joint]), 1 + nq + int(self.model.jnt_dofadr[joint])
             place, turn = [columns[a] for a in POSE[:3]], [columns[a] for a in POSE[3:]]
@@ -139,10 +157,8 @@ class MjcfSimulator:
             v[m.jnt_dofadr[joint]] = by.deriv()(away) * v[m.jnt_dofadr[other]]
         return state
 
-    def _own_state(self, log: Recording, whole: bool) -> np.ndarray:
-        """The model's own start of a log; of a window, what its run of the whole log has reached."""
-        if not whole and self._partial and log.name in self._runs:
-            return self._runs[log.name][log.first]
+    def _own_state(self, log: Recording) -> np.ndarray:
+        """The model's own start of a log."""
         state = self._reset()
         for column, (q, _) in self._places.items():
             seen = log[column][np.isfinite(log[column])]
@@ -182,15 +198,10 @@ class MjcfSimulator:
         return states < self.model.nv or self.model.na > 0
 
     def prepare(self, recordings: Sequence[Recording]) -> None:
-        """Run whole logs once to start windows from, where columns do not determine the whole state."""
-        if not (self._partial or self._ties):
-            return
-        for log in recordings:
-            first = self._state(Job({}, log, None))
-            found = free_run(self.model, self._data[0], log, first, self.driven)
-            found[0] = first
-            found[:, 0] = 0.0
-            self._runs[log.name] = np.where(np.isfinite(found), found, first)
+        """Keep logs to start windows from the model's run of them, where columns do not determine the whole
+        state."""
+        if self._partial or self._ties:
+            self._logs = {log.name: log for log in recordings}
 
     def contacts(self, recording: Recording) -> list[float]:
         """Times [s] at which the set of touching bodies changes along the recorded motion."""
@@ -234,6 +245,12 @@ class MjcfSimulator:
         return latest(self._touched, (poses.shape, poses.tobytes()), made)
 
 
+def tied(model: Any) -> np.ndarray:
+    """The active equalities (k,) by which one joint follows another."""
+    joints = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)
+    return np.flatnonzero(joints & (model.eq_obj2id >= 0))
+
+
 def ties(model: Any, seen: Sequence[int]) -> list[tuple[int, int, Polynomial]]:
     """Joints that no column shows but an equality has follow another, directly or not, that is `seen`.
 
@@ -244,8 +261,7 @@ def ties(model: Any, seen: Sequence[int]) -> list[tuple[int, int, Polynomial]]:
     out, known = list[tuple[int, int, Polynomial]](), {*seen}
     pairs = [
         (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]), Polynomial(model.eq_data[k, :5]))
-        for k in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool))
-        if model.eq_obj2id[k] >= 0
+        for k in tied(model)
     ]
     for _ in pairs:
         for joint, other, by in pairs:
@@ -262,6 +278,7 @@ def _mixed(a: Channels | None, b: Channels | None, share: float) -> Channels | N
     return None if a is None or b is None else {n: a[n] + share * (b[n] - a[n]) for n in a}
 
 
+TIE = ".tie"  # suffix of a setting: how softly a joint follows another
 # chosen: s: a contact that returns sooner was never lost: noise of the sensors breaks it
 BROKEN = 0.04
 

@@ -139,6 +139,9 @@ def _joint(model: Any, name: str, attribute: str) -> Setting | None:
     if attribute in laws:
         return Setting(f"joint:{name}.{attribute}", laws[attribute], 0.0, nothing, stored=False)
     dofs = np.flatnonzero(np.asarray(model.dof_jntid) == j)
+    tie = np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_obj1id == j))
+    if attribute == "tie" and tie.size:
+        return _field(f"joint:{name}.tie", "s", model, "eq_solref", (tie[0], 0))
     found = {
         "damping": ("dof_damping", dofs, f"{force} s/{way}"),
         "frictionloss": ("dof_frictionloss", dofs, force),
@@ -271,7 +274,7 @@ def _drive(model: Any, _: str, attribute: str) -> Setting | None:
 
 
 KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...]]] = {
-    "joint": (_joint, ("damping", "frictionloss", "armature", "stiffness", "springref", *OF_JOINTS)),
+    "joint": (_joint, ("damping", "frictionloss", "armature", "stiffness", "springref", "tie", *OF_JOINTS)),
     "body": (_body, ("mass", "com_x", "com_y", "com_z", "payload", "length")),
     "geom": (_geom, ("friction", "torsional", "time_constant", "damping_ratio", "dmin", "size")),
     "actuator": (_actuator, ("gain", "damping", "limit", FADE)),
@@ -314,7 +317,7 @@ def setting_of(model: Any, name: str) -> Setting:
 FIELDS = (
     *("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness", "qpos_spring"),
     *("body_mass", "body_inertia", "body_ipos", "body_pos", "body_gravcomp"),
-    *("geom_friction", "geom_solref", "geom_solimp", "geom_size", "geom_rbound"),
+    *("geom_friction", "geom_solref", "geom_solimp", "geom_size", "geom_rbound", "eq_solref"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_forcerange"),
 )  # all that settings set
 
