@@ -200,6 +200,8 @@ class Search:
                     point = {**best.point, name: other}
                     composed = best.composed.moved(point)
                     linear = linearise(composed, point, [*self.along, *best.names], best.linear.starts)
+                    if linear.diverged:
+                        continue
                     cov = covariances(composed, linear)
                     there = replace(best, composed=composed, point=point, linear=linear, covariances=cov)
                     sets, levels = self.propose(there, best.names)
@@ -218,6 +220,8 @@ class Search:
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
         whole = self.fit(names, begin, [self.fitted[frozenset()].covariances.whitener()])
+        if whole.linear.diverged:
+            return None
         sets, _ = self.propose(whole, names)
         names = sets.pruned(names, self._likeliest(sets, names)[1])
         return self.fit(names, self._likeliest(sets, names)[2], [whole.whiten])
@@ -444,6 +448,8 @@ class Search:
         for out in best.names:
             rest = tuple(n for n in best.names if n != out)
             less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), [best.whiten])
+            if less.linear.diverged:  # nothing can be proposed about it
+                continue
             there = less if self._is_better(less, best) else self._find_better(less, best)
             if there is not None:
                 return there

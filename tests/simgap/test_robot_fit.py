@@ -56,6 +56,18 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
     assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
 
 
+def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(damped):
+    search = Search(damped, tuple(damped.effects), damped.rows.log)
+    nothing, names = search.nothing(), tuple(damped.effects)
+    best = replace(nothing, names=names, point={n: e.neutral() for n, e in damped.effects.items()})
+    for out in names:
+        rest = tuple(n for n in names if n != out)
+        search.fitted[frozenset(rest)] = replace(
+            nothing, names=rest, linear=replace(nothing.linear, moved={}, diverged=rest), score=-np.inf
+        )
+    assert search._exchange(best) is None
+
+
 def test_what_is_settled_stays(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing = search.nothing()

@@ -60,7 +60,7 @@ class MjcfSimulator:
         self._runs_of = Runs(self.model, self._data, self.channels, self.sensor, self.driven, self.free)
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
-        self._ties = ties(self.model, [*self.joints.values()])
+        self._ties = [(*tie, tie[-1].deriv()) for tie in ties(self.model, [*self.joints.values()])]
         self._nominal = {n: s.nominal for n, s in self.settings.items()}
         self.uncertain, self.sd = self.map.uncertain, self.map.sd  # as the diagnosis asks for them
 
@@ -151,10 +151,10 @@ class MjcfSimulator:
         """A full physics state with joints that follow others where these have them."""
         state = state.copy()
         m, q, v = self.model, state[1:], state[1 + self.model.nq :]
-        for joint, other, by in self._ties:
+        for joint, other, by, slope in self._ties:
             at, away = m.jnt_qposadr[joint], q[m.jnt_qposadr[other]] - m.qpos0[m.jnt_qposadr[other]]
             q[at] = m.qpos0[at] + by(away)
-            v[m.jnt_dofadr[joint]] = by.deriv()(away) * v[m.jnt_dofadr[other]]
+            v[m.jnt_dofadr[joint]] = slope(away) * v[m.jnt_dofadr[other]]
         return state
 
     def _own_state(self, log: Recording) -> np.ndarray:
