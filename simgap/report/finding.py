@@ -39,6 +39,8 @@ PARTS = {
     "joint.damping": ("viscous friction", "Swing {0} unpowered and watch how fast it comes to rest."),
     "joint.armature": ("rotor inertia", "Look up the rotor's inertia of {0}, times its gear ratio squared."),
     "joint.stiffness": ("a spring or a cable", "Move {0} by hand, unpowered: do cables pull it back?"),
+    "joint.cogging": ("cogging", "Turn {0} slowly by hand, unpowered: does it snap into places?"),
+    "joint.ripple": ("uneven torque of the motor", "Hold {0} against a balance at several angles."),
     "joint.tie": ("softness of a tie", "Hold what {0} is tied to, press on {0}, and measure its give."),
     "joint.springref": ("a spring's rest", "Find where {0} comes to rest, unpowered."),
     "joint.stribeck": ("friction that falls with speed", "Turn {0} slowly, then fast; note the torques."),

@@ -42,7 +42,7 @@ EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which sets are scored
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, how many teach by how much proposals of replacements are wrong
-LEADERS = 16  # numerics: candidates that are rolled out where they fit best
+LEADERS = (16, 4)  # numerics: candidates that are rolled out where they fit best, and that once more
 USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
@@ -344,11 +344,13 @@ class Search:
         if not held:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
-        linear = self._roll_out_leaders(composed, base, linear, sets, held)
-        return self._sets(linear, levels, names), levels
+        for count in LEADERS:  # where the gap is large, one straight line leads only part of the way
+            linear = self._roll_out_leaders(composed, base, linear, sets, held, count)
+            sets = self._sets(linear, levels, names)
+        return sets, levels
 
     def _roll_out_leaders(
-        self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names
+        self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names, count: int
     ) -> Linear:
         """The leading candidates rolled out where they fit best: what kinks or saturates is a straight line
         from there only."""
@@ -356,7 +358,7 @@ class Search:
         for level in dict.fromkeys((0, sets.gram.shape[0] - 1)):
             others = [n for n in sets.names if n not in held]
             score = sets.scores([(*held, n) for n in others], level)
-            for name in (others[k] for k in np.argsort(-score)[:LEADERS]):
+            for name in (others[k] for k in np.argsort(-score)[:count]):
                 if name not in first:
                     names = (*held, name)
                     found = point_of(effects, sets.fit(names, level), names, self.along)

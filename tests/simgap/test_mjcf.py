@@ -22,6 +22,7 @@ from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
 from simgap.simulators.mjcf.map import proposed_map  # noqa: E402
 from simgap.simulators.mjcf.runs import Held, _carried_out, _commanded  # noqa: E402
 from simgap.simulators.mjcf.setting import FIELDS, changed_model  # noqa: E402
+from simgap.simulators.mjcf.transmission import Motion, periods  # noqa: E402
 
 XML = """<mujoco model="swing">
   <compiler angle="radian"/>
@@ -574,6 +575,37 @@ def test_drag_and_a_drive_that_fades():
     np.testing.assert_allclose(rate, 5 / (1 + 0.01 * 5 / INERTIA * t), rtol=1e-3)
     _, rate, t = swung(gravity=False, torque=1.0, fade=0.3, seconds=0.05)  # half of the most: 15 % less
     assert rate[-1] / t[-1] == pytest.approx(0.85 / INERTIA, rel=1e-3)
+
+
+def test_cogging_and_ripple_come_and_go_with_the_angle():
+    wave = 0.02 * np.cos(7 * 0.5) + 0.05 * np.sin(7 * 0.5)
+    for law, torque, gives in (("cogging", 0.0, wave), ("ripple", 0.2, 0.2 * (1 + wave))):
+        named = zip(("per_turn", "cos", "sin"), (7.0, 0.02, 0.05), strict=True)
+        laws = {f"{law}_{part}": value for part, value in named}
+        _, rate, t = swung(gravity=False, angle=0.5, torque=torque, seconds=0.01, **laws)
+        assert rate[-1] / t[-1] == pytest.approx(gives / INERTIA, rel=0.01)
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+def test_how_often_a_torque_comes_and_goes_is_read_off_the_logs(scaled):
+    rng, t = np.random.default_rng(2), np.arange(0, 6, 0.01)
+    q, motor = np.sin(1.7 * t), 0.2 * np.cos(2.9 * t)
+    lost = 0.1 * np.sin(7 * q + 1) * (motor if scaled else 0.2)
+    torque = motor + lost + 0.01 * q + 0.004 * rng.standard_normal(t.size)
+    motion = Motion({0: q}, {0: np.gradient(q, t)}, {}, {0: torque}, {0: motor})
+    assert periods([motion], 0, scaled) == pytest.approx(7, abs=0.5)
+    still = Motion({0: 0.01 * q}, {0: 0 * q}, {}, {0: torque}, {0: motor})
+    assert not periods([still], 0, scaled)
+
+
+def test_a_law_acts_with_its_own_numbers_where_these_are_as_it_came(files):
+    """Stribeck's speed is read off the logs, and not 1 rad/s."""
+    found, log, _ = loaded(files)
+    own = {n: p.nominal for n, p in found.simulator.parameters.items()} | {"joint:pivot.stribeck_extra": 0.1}
+    near = own | {"joint:pivot.stribeck_speed": own["joint:pivot.stribeck_speed"] * (1 + 1e-9)}
+    jobs = [Job(values, log.window(0, 60), {"q": 0.1, "q_rate": 0.3}) for values in (own, near)]
+    one, two = found.simulator.simulate_many(jobs)
+    np.testing.assert_allclose(one["q"], two["q"], atol=1e-9)
 
 
 def test_laws_that_do_nothing_run_as_the_plain_model():

@@ -37,6 +37,7 @@ from simgap.simulators.mjcf.transmission import (
     Motion,
     elasticity,
     motion_of,
+    periods,
     sizes_of,
 )
 from simgap.simulators.protocol import Parameter
@@ -115,6 +116,20 @@ class _Catalogue:
             self.add(f"{head}.stribeck_extra", torque, says, low=0.0, effect=f"{head}.stribeck")
             speed = replace(setting_of(self.model, f"{head}.stribeck_speed"), nominal=0.3 * rate)
             self.add(speed.name, 0.1 * rate, says, 0.03 * rate, effect=f"{head}.stribeck", setting=speed)
+
+            for law, scaled, what in (
+                ("cogging", False, "a torque on {} that comes and goes around the turn"),
+                ("ripple", True, "a motor of {} whose strength comes and goes around the turn"),
+            ):
+                often = periods(motions, j, scaled) if int(self.model.jnt_type[j]) == HINGE else 0.0
+                if not often:
+                    continue
+                says, effect = what.format(name), f"{head}.{law}"
+                for part in ("cos", "sin"):
+                    self.add(f"{effect}_{part}", SHARE if scaled else torque, says, effect=effect)
+                wave = replace(setting_of(self.model, f"{effect}_per_turn"), nominal=often)
+                near = np.pi / float(np.ptp(np.concatenate([m.position[j] for m in motions])))
+                self.add(wave.name, 0.5 * near, says, often - near, often + near, effect, wave)
 
     def add_ties(self) -> None:
         """How softly joints follow those that equalities tie them to: MuJoCo's default is softer than any

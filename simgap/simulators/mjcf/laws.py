@@ -1,5 +1,5 @@
-"""Laws that MuJoCo lacks and that depend on the state: friction by load, speed or direction, drag, fading
-drives.
+"""Laws that MuJoCo lacks and that depend on the state: friction by load, speed or direction, drag, cogging,
+fading drives.
 
 Friction is a constraint that holds a joint at rest; its limit is set before each step,
 
@@ -8,20 +8,21 @@ Friction is a constraint that holds a joint at rest; its limit is set before eac
 with w the joint's rate, m the torque of its motors and b that of gravity and the other joints' motion: what
 presses on the gears from either side, in balance the torque that they transmit (model M4 of Duclusaud et al.,
 Extended friction models for the physics simulation of servo actuators, 2024). A fading drive gives f (1 -
-fade |f| / most), with most the largest force it can give. A step uses the quantities of the one before it.
+fade |f| / most), with most the largest force it can give. Cogging adds c cos(n q) + s sin(n q) to a joint at
+q, and ripple that times m. A step uses the quantities of the one before it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp
+from math import cos, exp, sin
 from typing import Any
 
 import numpy as np
 
 from simgap.simulators.mjcf.engine import FULL, mujoco
-from simgap.simulators.mjcf.setting import FADE, OF_JOINTS, most_of, object_id
+from simgap.simulators.mjcf.setting import FADE, OF_FRICTION, UNEVEN, most_of, object_id
 
 MOTOR = ":motor"  # suffix of a joint's name: its motor, where that is a body of its own
 
@@ -38,41 +39,48 @@ class _Friction:
 
 @dataclass(frozen=True)
 class Laws:
-    """Laws that act in a model: `friction` of joints, and of `fading` drives the actuator, the fade over its
-    largest force, the joint's number, and its torque by a unit force."""
+    """Laws that act in a model.
+
+    `friction`: of joints; `fading`: by drive the actuator, the fade over its largest force, the joint's
+    number, and its torque by a unit force; `uneven`: by joint the numbers of coordinate and velocity, the
+    periods per turn, both amplitudes, and whether they multiply the motor's torque.
+    """
 
     friction: tuple[_Friction, ...]
     fading: tuple[tuple[int, float, int, float], ...]
+    uneven: tuple[tuple[int, int, float, float, float, bool], ...]
 
     def __bool__(self) -> bool:
-        return bool(self.friction or self.fading)
+        return bool(self.friction or self.fading or self.uneven)
 
     @classmethod
     def of(cls, model: Any, changed: Sequence[tuple[str, float]]) -> Laws:
         """The laws of the changed settings."""
         joints: dict[str, dict[str, float]] = {}
-        fading = []
+        fading, uneven = [], []
         for name, value in changed:
             head, _, attribute = name.rpartition(".")
             kind, _, thing = head.partition(":")
-            if kind == "joint" and attribute in OF_JOINTS:
+            if kind == "joint" and attribute in (*OF_FRICTION, *UNEVEN):
                 joints.setdefault(thing, {})[attribute] = value
             elif kind == "actuator" and attribute == FADE:
                 a = object_id(model, "actuator", thing)
                 dof = int(model.jnt_dofadr[int(model.actuator_trnid[a, 0])])
                 by = value / max(most_of(model, a), 1e-9)
                 fading.append((a, by, dof, float(model.actuator_gear[a, 0])))
-        friction = tuple(
-            _friction(model, n, own) for n, own in joints.items() if {*own} != {"stribeck_speed"}
-        )
-        return cls(friction, tuple(fading))
-
-
-def _friction(model: Any, joint: str, own: Mapping[str, float]) -> _Friction:
-    j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{joint}{MOTOR}")
-    dof = int(model.jnt_dofadr[object_id(model, "joint", joint) if j < 0 else j])
-    share, skew, extra, speed, drag = ({"stribeck_speed": 1.0, **own}.get(n, 0.0) for n in OF_JOINTS)
-    return _Friction(dof, share, skew, extra, max(speed, 1e-9), drag)
+        friction = []
+        for joint, own in joints.items():
+            j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{joint}{MOTOR}")
+            j = object_id(model, "joint", joint) if j < 0 else j
+            place, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
+            share, skew, extra, speed, drag = (own.get(n, 0.0) for n in OF_FRICTION)
+            if share or skew or extra or drag:
+                friction.append(_Friction(dof, share, skew, extra, max(speed, 1e-9), drag))
+            for scaled in (False, True):
+                wave = [own.get(n, 0.0) for n in UNEVEN[3 * scaled : 3 + 3 * scaled]]
+                if any(wave[1:]):
+                    uneven.append((place, dof, *wave, scaled))
+        return cls(tuple(friction), tuple(fading), tuple(uneven))
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
@@ -91,10 +99,12 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
     plain, nu, step = np.array(model.dof_frictionloss), model.nu, mujoco.mj_step
     # Plain numbers and views of memory, several times as fast as elements and rows of arrays.
     friction = [(f.dof, float(plain[f.dof]), 0.5 * f.share, *vars(f).values()) for f in laws.friction]
-    seen = model.dof_frictionloss, data.qvel, data.qfrc_actuator, data.qfrc_bias, data.actuator_force
-    views: list[Any] = [memoryview(one) for one in (*seen, data.qfrc_applied, data.ctrl, data.sensordata)]
-    limit, rate, motor, bias, force, pushed, ctrl, sensed = views
+    seen = model.dof_frictionloss, data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_bias
+    given = data.actuator_force, data.qfrc_applied, data.ctrl, data.sensordata
+    views: list[Any] = [memoryview(one) for one in (*seen, *given)]
+    limit, angle, rate, motor, bias, force, pushed, ctrl, sensed = views
     applied = {*(f.dof for f in laws.friction if f.drag), *(dof for _, _, dof, _ in laws.fading)}
+    applied |= {one[1] for one in laws.uneven}
     try:
         for b in range(len(first)):
             model.dof_frictionloss[:] = plain
@@ -103,7 +113,7 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
             data.ctrl[:] = control[b, 0]
             mujoco.mj_forward(model, data)
             data.qacc_warmstart[:] = 0.0
-            given, told = memoryview(control[b].ravel()), []
+            asked, told = memoryview(control[b].ravel()), []
             for k in range(0, control[b].size, nu) if nu else range(control.shape[1]):
                 for dof in applied:
                     pushed[dof] = 0.0
@@ -119,7 +129,10 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
                         pushed[d] -= drag * rate[d] * abs(rate[d])
                 for a, by, dof, gear in laws.fading:
                     pushed[dof] -= by * abs(force[a]) * force[a] * gear
-                ctrl[:] = given[k : k + nu]
+                for q, d, often, even, odd, scaled in laws.uneven:
+                    wave = even * cos(often * angle[q]) + odd * sin(often * angle[q])
+                    pushed[d] += wave * motor[d] if scaled else wave
+                ctrl[:] = asked[k : k + nu]
                 step(model, data)
                 told.append(sensed.tobytes())
             out[b] = np.frombuffer(b"".join(told)).reshape(out[b].shape)

@@ -18,7 +18,7 @@ from simgap.simulators.mjcf.engine import FULL, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
-from simgap.simulators.mjcf.setting import HOLD, LATE, SMOOTH, Setting, changed_model, object_id
+from simgap.simulators.mjcf.setting import HOLD, LATE, SMOOTH, Setting, changed_model, nothing, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
 
@@ -62,6 +62,9 @@ class MjcfSimulator:
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
         self._ties = [(*tie, tie[-1].deriv()) for tie in ties(self.model, [*self.joints.values()])]
         self._nominal = {n: s.nominal for n, s in self.settings.items()}
+        # A law that acts needs all its numbers, those too that are as it came.
+        of_laws = (n for n, s in self.settings.items() if s.put is nothing and s.nominal)
+        self._shapes = {n: self.parameters[n].effect for n in of_laws}
         self.uncertain, self.sd = self.map.uncertain, self.map.sd  # as the diagnosis asks for them
 
     def simulate(self, parameters: Values, recording: Recording, start: Values | None = None) -> Channels:
@@ -74,7 +77,9 @@ class MjcfSimulator:
         out: list[Channels | None] = [None] * len(jobs)
         groups: dict[tuple, list[int]] = defaultdict(list)
         for i, job in enumerate(jobs):
-            changed = tuple((n, v) for n, v in job.parameters.items() if v != self._nominal[n])
+            values, own = job.parameters.items(), self._nominal
+            acting = {self.parameters[n].effect for n, v in values if v != own[n]}
+            changed = tuple((n, v) for n, v in values if v != own[n] or self._shapes.get(n, "") in acting)
             groups[changed].append(i)
         for key, mine in groups.items():
             mixed = [(n, v) for n, v in key if self.settings[n].mixed is not None]

@@ -17,7 +17,8 @@ from hmmseg.errors import InputError, nearest
 from simgap.simulators.mjcf.engine import FREE, HINGE, mujoco
 
 Put = Callable[[Any, float], None]
-OF_JOINTS = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
+OF_FRICTION = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
+UNEVEN = tuple(f"{law}_{part}" for law in ("cogging", "ripple") for part in ("per_turn", "cos", "sin"))
 FADE = "fade"  # a law of actuators
 # How commands are held between samples: 0 in steps; 1 in lines to the next, as they are where a step begins.
 HOLD = "option.hold"
@@ -135,7 +136,8 @@ def _joint(model: Any, name: str, attribute: str) -> Setting | None:
     j = object_id(model, "joint", name)
     turning = int(model.jnt_type[j]) == HINGE
     force, way = ("N m", "rad") if turning else ("N", "m")
-    laws = dict(zip(OF_JOINTS, ("1", force, force, f"{way}/s", f"{force} s^2/{way}^2"), strict=True))
+    units = "1", force, force, f"{way}/s", f"{force} s^2/{way}^2", "1", force, force, "1", "1", "1"
+    laws = dict(zip((*OF_FRICTION, *UNEVEN), units, strict=True))
     if attribute in laws:
         return Setting(f"joint:{name}.{attribute}", laws[attribute], 0.0, nothing, stored=False)
     dofs = np.flatnonzero(np.asarray(model.dof_jntid) == j)
@@ -274,7 +276,10 @@ def _drive(model: Any, _: str, attribute: str) -> Setting | None:
 
 
 KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...]]] = {
-    "joint": (_joint, ("damping", "frictionloss", "armature", "stiffness", "springref", "tie", *OF_JOINTS)),
+    "joint": (
+        _joint,
+        ("damping", "frictionloss", "armature", "stiffness", "springref", "tie", *OF_FRICTION, *UNEVEN),
+    ),
     "body": (_body, ("mass", "com_x", "com_y", "com_z", "payload", "length")),
     "geom": (_geom, ("friction", "torsional", "time_constant", "damping_ratio", "dmin", "size")),
     "actuator": (_actuator, ("gain", "damping", "limit", FADE)),

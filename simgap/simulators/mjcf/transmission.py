@@ -96,16 +96,46 @@ def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
 
 
 SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic
+OFTEN = 100.0  # limit: periods per turn
+
+
+def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
+    """How often per turn a joint's torque comes and goes most: a wave or, `scaled`, a share of the motor's.
+
+    What motors give less what the motion takes, regressed on waves of the joint's angle next to what changes
+    slowly with it (the periodogram of Lomb 1976 and Scargle 1982). 0 where the joint does not turn enough.
+    """
+    q, rate, torque, motor = (
+        np.concatenate([getattr(m, name)[joint] for m in motions])
+        for name in ("position", "rate", "torque", "motor")
+    )
+    span = float(np.ptp(q))
+    if span * OFTEN < 4 * np.pi:
+        return 0.0
+    often = np.arange(max(2.0, np.pi / span), OFTEN, np.pi / (4 * span))
+    slow = np.column_stack([q**0, q, np.sin(q), np.cos(q), rate, np.sign(rate), motor, motor * q])
+    basis = np.linalg.qr(slow / np.maximum(np.abs(slow).max(0), 1e-12))[0]
+    left = torque - motor
+    left = left - basis @ (basis.T @ left)
+    gains = []
+    for n in often:
+        pair = np.column_stack([np.cos(n * q), np.sin(n * q)])
+        pair = pair * motor[:, None] if scaled else pair
+        pair = pair - basis @ (basis.T @ pair)
+        gains.append(float(left @ pair @ np.linalg.lstsq(pair, left, rcond=1e-6)[0]))
+    return float(often[int(np.argmax(gains))])
 
 
 @dataclass(frozen=True)
 class Motion:
-    """By joint, along a log's samples (n,): position, rate, acceleration and the torque that they take."""
+    """By joint, along a log's samples (n,): position, rate, acceleration, the torque that they take, and what
+    motors give there."""
 
     position: dict[int, np.ndarray]
     rate: dict[int, np.ndarray]
     acceleration: dict[int, np.ndarray]
     torque: dict[int, np.ndarray]
+    motor: dict[int, np.ndarray]
 
 
 def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
@@ -115,17 +145,23 @@ def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
     for column, joint in simulator.joints.items():
         position[joint], rate[joint], acceleration[joint] = smoothed(log.t, log[column])
     data = mujoco.MjData(model)
-    torque = {j: np.zeros(len(log)) for j in position}
+    torque, motor = ({j: np.zeros(len(log)) for j in position} for _ in range(2))
     rows = np.arange(0, len(log), max(1, round(len(log) / max(float(log.t[-1] - log.t[0]) * 100.0, 1.0))))
     for i in rows:
         for j in position:
             q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
             data.qpos[q], data.qvel[v], data.qacc[v] = position[j][i], rate[j][i], acceleration[j][i]
+        for column, a in simulator.driven.items():
+            data.ctrl[a] = np.nan_to_num(log[column][i])
         mujoco.mj_inverse(model, data)
+        mujoco.mj_fwdActuation(model, data)
         for j in position:
-            torque[j][i] = data.qfrc_inverse[model.jnt_dofadr[j]]
-    full = {j: np.interp(log.t, log.t[rows], values[rows]) for j, values in torque.items()}
-    return Motion(position, rate, acceleration, full)
+            v = model.jnt_dofadr[j]
+            torque[j][i], motor[j][i] = data.qfrc_inverse[v], data.qfrc_actuator[v]
+    full, given = (
+        {j: np.interp(log.t, log.t[rows], one[rows]) for j, one in each.items()} for each in (torque, motor)
+    )
+    return Motion(position, rate, acceleration, full, given)
 
 
 def smoothed(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
