@@ -15,6 +15,7 @@ from simgap.robots.linear import linearise
 from simgap.robots.model import Composed
 from simgap.robots.rows import noises, phases_of
 from simgap.robots.search import BETTER, Search
+from simgap.robots.sets import point_of
 from simgap.robots.verdict import Shrinkage, verdict_on
 from simgap.robots.whiten import covariances
 from simgap.simulators.protocol import Channel, Parameter
@@ -54,6 +55,15 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
     model = composed(Brittle(), [log(0, viscous=VISCOUS)])
     found = fit(model, {"viscous": {"viscous": 0.2}})
     assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
+
+
+def test_a_large_cause_is_proposed_near_its_size():
+    """Ten times its usual size; a straight line from the usual size leads to 0.08."""
+    model = composed(Swing(), [log(s, viscous=0.1) for s in range(2)])
+    search = Search(model, tuple(model.effects), model.rows.log)
+    sets, _ = search.propose(search.nothing(), search.wanted)
+    found = point_of(model.effects, sets.fit(("viscous",), 0), ("viscous",), search.along)
+    assert found["viscous"]["viscous"] == pytest.approx(0.1, rel=0.1)
 
 
 def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(damped):
