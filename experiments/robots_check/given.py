@@ -66,8 +66,8 @@ def main() -> None:
             for short, p in found["effects"][cause]["parameters"].items()
         }  # fmt: skip
         out[case.name] = {
-            "right": right(found, wanted, case.name), "truth": wanted, "verdict": found["verdict"], "causes": values,
-            "indistinguishable": found["indistinguishable"], "seconds": round(found["seconds"], 1),
+            "right": right(found, wanted, case.name), "truth": wanted,
+            "verdict": found["verdict"], "causes": values, "indistinguishable": found["indistinguishable"], "seconds": round(found["seconds"], 1),
             "over_noise": found["remainder"]["rms_over_noise"],
         }  # fmt: skip
         print(case.name, json.dumps(out[case.name]), flush=True)
