@@ -67,8 +67,8 @@ def main() -> None:
         }  # fmt: skip
         out[case.name] = {
             "right": right(found, wanted, case.name), "truth": wanted,
-            "verdict": found["verdict"], "causes": values, "indistinguishable": found["indistinguishable"], "seconds": round(found["seconds"], 1),
-            "over_noise": found["remainder"]["rms_over_noise"],
+            "verdict": found["verdict"], "causes": values, "indistinguishable": found["indistinguishable"],
+            "seconds": round(found["seconds"], 1), "over_noise": found["remainder"]["rms_over_noise"],
         }  # fmt: skip
         print(case.name, json.dumps(out[case.name]), flush=True)
     save(given.output, out)
