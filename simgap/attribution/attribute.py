@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.stats import chi2
 
 from hmmseg.errors import InputError
 from simgap.attribution.heldout import (
@@ -288,16 +287,15 @@ def _explanation(
 
 
 def _small(f: Forms, best: Model, by_group: np.ndarray, absorbed: np.ndarray | None) -> SmallGap | None:
-    """The gap's size if it does not matter: neither residuals nor what nuisances hide of it do."""
+    """The gap's size if it does not matter: neither residuals nor what properties absorb of it do."""
     assert f.gap.tolerance is not None
     small = small_gap(f, np.minimum(by_group, 1.0), f.gap.tolerance)
     if small.size >= 1.0:
         return None
-    without = fitted(f, ()).x[: f.spectrum.num_nuisances]
-    if chi2.sf(without @ without, without.size) < ALARM:  # they are where they never are
-        return None
-    if absorbed is not None and (np.abs(best.x[: absorbed.size] - without[: absorbed.size]) > absorbed).any():
-        return None
+    if absorbed is not None:
+        moved = np.abs(best.x[: absorbed.size] - fitted(f, ()).x[: absorbed.size])
+        if (moved > absorbed).any():
+            return None
     return small
 
 

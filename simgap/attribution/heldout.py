@@ -176,20 +176,15 @@ class Heldout:
         return cls(noise, whole, among, folds)
 
     def how_far(self, effects: Sequence[int]) -> HowFar | None:
-        """How far a set of effects shrinks the gap; None if held-out trials show none.
-
-        Trials quieter than noise is allowed to be show none, and hide none of what was measured apart.
-        """
+        """How far a set of effects shrinks the gap; None if held-out trials show none."""
         (before, _), (after, _) = self._squares(()), self._squares(effects)
         plain, z = fitted(self.whole, ()), self.whole.spectrum.num_nuisances
         determined = z - float(np.trace(plain.covariance))
         floor = np.array([*(test.count.sum() for _, test in self.folds), determined])
-        shown = np.append(np.repeat((before - floor)[:-1].sum() > 0, len(self.folds)), True)
-        if float(((before - floor) * shown).sum()) <= 0:
+        if before.sum() <= floor.sum():
             return None
-        n, score = float(floor[shown].sum()), self.gain(effects, ())
-        gone = fraction_gone((before - after) * shown, (before - floor) * shown)
-        return HowFar(float(before[shown].sum()) / n, float(after[shown].sum()) / n, 1.0, *gone, score)
+        n, gone = float(floor.sum()), fraction_gone(before - after, before - floor)
+        return HowFar(float(before.sum()) / n, float(after.sum()) / n, 1.0, *gone, self.gain(effects, ()))
 
     def gain(self, effects: Sequence[int], without: Sequence[int]) -> float:
         """Gain of the log predictive density of all trials [nats] by `effects` over the set `without`."""

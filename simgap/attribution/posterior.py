@@ -40,12 +40,12 @@ class Background:
     log_prior: np.ndarray
 
     @classmethod
-    def usual(cls, stated: float = STATED, off: float = OFF) -> Background:
+    def usual(cls, off: float = OFF) -> Background:
         """Noise about as stated, or the model off."""
         grid = np.concatenate(
-            [np.linspace(-3, 3, NEAR) * stated, np.linspace(4 * stated, np.log(LARGEST), FAR)]
+            [np.linspace(-3, 3, NEAR) * STATED, np.linspace(4 * STATED, np.log(LARGEST), FAR)]
         )
-        normal = -0.5 * (grid[:NEAR] / stated) ** 2
+        normal = -0.5 * (grid[:NEAR] / STATED) ** 2
         log_prior = np.concatenate([
             np.log(1 - off) + normal - np.logaddexp.reduce(normal), np.full(FAR, np.log(off / FAR)),
         ])  # fmt: skip
@@ -247,10 +247,8 @@ class Forms:
 
     @cached_property
     def log_odds(self) -> float:
-        """Prior log odds of each effect to act."""
-        number = len({c.name for c in self.gap.candidates})
-        share = min(self.gap.expected / max(number, 1), 0.5)
-        return float(np.log(share / (1 - share)))
+        """Prior log odds of each effect to act: one is expected to."""
+        return -float(np.log(max(len({c.name for c in self.gap.candidates}) - 1, 1)))
 
 
 def forms(gap: Gap, background: Background | None = None) -> Forms:
@@ -271,21 +269,9 @@ def channel_of(f: Forms) -> np.ndarray:
 
 
 def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
-    """Find a set's mode and evidence, from two starts; the better one counts.
-
-    Groups are first weighted alike, then as they would be with every effect at its point of linearisation.
-    """
-    if effects in f.modes:
-        return f.modes[effects]
-    own = quadratic_forms(f, effects)
-    modes = [mode(f, own, np.ones(f.count.size))]
-    if effects:
-        x = np.zeros(own.low.size)
-        for j, mine in own.blocks.items():
-            c = f.gap.candidates[j]
-            x[mine] = (c.at - c.neutral) / c.scale
-        modes.append(mode(f, own, f.marginal(effects, own.energy(x))[1], x))
-    f.modes[effects] = max(modes, key=lambda m: m.score)
+    """Find a set's mode and evidence, with groups first weighted alike."""
+    if effects not in f.modes:
+        f.modes[effects] = mode(f, quadratic_forms(f, effects), np.ones(f.count.size))
     return f.modes[effects]
 
 
@@ -346,21 +332,17 @@ def quadratic_forms(f: Forms, effects: tuple[int, ...]) -> QuadraticForms:
     )
 
 
-def mode(
-    f: Forms, taken: QuadraticForms, precision: np.ndarray, x: np.ndarray | None = None, steps: int = STEPS
-) -> Model:
+def mode(f: Forms, taken: QuadraticForms, precision: np.ndarray, steps: int = STEPS) -> Model:
     """Find the mode of a set by iteratively reweighted least squares.
 
     Args:
         f: Quadratic forms of the gap.
         taken: Those of the set.
         precision: Precisions (G,) of the groups to start from.
-        x: Coordinates to start from; zero if None.
         steps: Most iterations.
     """
     z, size = f.spectrum.num_nuisances, taken.low.size
-    x = np.zeros(size) if x is None else x
-    value, prior, energy = -np.inf, np.ones(size), taken.square
+    x, value, prior, energy = np.zeros(size), -np.inf, np.ones(size), taken.square
     held = np.zeros(size, bool)
     for _ in range(steps):
         for mine in taken.blocks.values():

@@ -134,7 +134,6 @@ class Gap:
         residual: Whitened residuals (n,).
         nuisance: Derivatives (n, z) by nuisances, whose prior is N(0, 1).
         candidates: The effects that may act.
-        expected: Prior mean number of effects that act.
         carried: Errors (D, n, M) that noise of the recordings causes in the spectra of `raw_columns`; their
             products, summed over D, are the noise's.
         tolerance: Smallest shift (n,) of each row that matters, in standard deviations of its noise.
@@ -147,7 +146,6 @@ class Gap:
     residual: Float[np.ndarray, " n"]
     nuisance: Float[np.ndarray, "n z"]
     candidates: tuple[Candidate, ...]
-    expected: float = 1.0
     carried: Float[np.ndarray, "d n m"] | None = None
     tolerance: Float[np.ndarray, " n"] | None = None
     usual: bool = False

@@ -28,7 +28,6 @@ from simgap.gap.problem import (
     residual_at,
     tolerated,
 )
-from simgap.gap.sensor_noise import MEDIAN
 from simgap.phases import Phase
 
 # Effects that scatter residuals instead of shifting them: the variance they add, and their size.
@@ -121,6 +120,7 @@ COLOURS = np.linspace(0.0, 0.4, 9)  # prior: correlation from sample to sample; 
 NOISE_BANDS = 6  # numerics: bands whose medians are taken
 SLOWEST = 1.0  # chosen: Hz; slower motion shows effects rather than noise
 OUTLIER = 8.0  # chosen: nats; most that a band costs, as an effect may fill it
+MEDIAN = 0.4549  # physics: median of the square of a standard normal number
 FEWEST = 12  # numerics: fewest coefficients of a band
 # numerics: variance of residuals over that of noise alone, above which they do not show the noise
 CLEAN = 1.25
@@ -267,18 +267,6 @@ def on_other(other: Problem, f: Fitted, usual: np.ndarray | None = None) -> Fitt
     `usual` are the derivatives with respect to the properties, if known.
     """
     return evaluated(other, f.effects, f.u, f.columns, usual)
-
-
-def noise_gained(others: Sequence[Problem], healthy: Fitted, f: Fitted) -> float:
-    """Gain of a fit [nats] over the one without effects because it leaves less of the sensor noise."""
-    columns = np.stack([healthy.residual, f.residual], 1)
-    noise = carried(
-        columns,
-        others,
-        lambda other: np.stack([on_other(other, healthy).residual, on_other(other, f).residual], 1),
-    )
-    without, left = np.square(noise.astype(float)).sum((0, 1))
-    return 0.5 * float(without - left)
 
 
 # chosen: squared residual [noise's] from a usual error of a property, above which it shows at all

@@ -21,25 +21,21 @@ LANDING = 4e-5  # prior: m; sd of a pad's slip in the shock of landing
 BEYOND = 5e-3  # prior: kg; sd of a pad's mass in front of its sensor, whose weight was tared
 
 
-def with_nuisances(given: Problem, at: np.ndarray | None = None) -> Problem:
-    """Add the nuisances, linearised without effects `at` given coordinates, else where they were before.
+def with_nuisances(given: Problem) -> Problem:
+    """Add the nuisances, linearised without effects, with properties at the centre of their prior.
 
     Their number depends only on trials, grips and rig. A column of zeros is kept, as with additional noise on
     the recordings it may not be zero (`simgap.gap.assemble`).
     """
-    at = given.nuisances.at if at is None else at
     columns = [
-        *_admitted(given, at), *_inertial(given), *_late_rates(given), *_settling(given), *_rounding(given),
+        *_admitted(given), *_inertial(given), *_late_rates(given), *_settling(given),
     ]  # fmt: skip
-    return replace(given, nuisances=Nuisances(np.concatenate(columns, 1), at))
+    return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))
 
 
-def _admitted(given: Problem, at: np.ndarray | None) -> list[np.ndarray]:
+def _admitted(given: Problem) -> list[np.ndarray]:
     """Columns (n, .) of what rig.toml admits under [systematic]."""
     out, k, u = [], given.num_common, neutral(given)
-    if at is not None:  # an effect may have pulled it far off
-        turning = slice(given.centre.size, k)
-        u[turning] = np.minimum(at[turning], 1.0)
     for slot in slots(k)[0]:
         if slot.effect.admitted is None:
             continue
@@ -119,19 +115,6 @@ def _settling(given: Problem) -> list[np.ndarray]:
             out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., Phase.CARRY]}))
             for name, share in (("y", 0.5**0.5), ("offset", 2**0.5)):
                 out.append(_column(given, {name: share * LANDING * mine * arrays.phase[..., Phase.PLACE]}))
-    return out
-
-
-def _rounding(given: Problem) -> list[np.ndarray]:
-    """Columns (n, 1) of rounding errors that all trials share: equal loads are rounded alike."""
-    world, arrays, out = given.frame.world, given.frame.arrays, []
-    size, held = given.frame.step / np.sqrt(12), world.ground + world.carry
-    for o in range(arrays.objects.shape[1]) if size else ():
-        mine = held * (arrays.onehot @ arrays.objects[:, o])
-        for k in range(4):
-            force = world.force + size * mine[..., None] * np.eye(4)[k]
-            change = residual_of(given, world._replace(force=force)) - residual_of(given, world)
-            out.append(-change[:, None])
     return out
 
 

@@ -24,13 +24,9 @@ from simgap.gap.residuals import STANCES, contact, residuals
 
 @dataclass(frozen=True)
 class Nuisances:
-    """Derivatives (n, Z) of whitened residuals by nuisances, in units of their prior standard deviations.
-
-    They were taken without effects, `at` coordinates (all columns) of which those of turning count.
-    """
+    """Derivatives (n, Z) of whitened residuals by nuisances, in units of their prior standard deviations."""
 
     columns: np.ndarray
-    at: np.ndarray | None = None
 
     @cached_property
     def _basis(self) -> tuple[np.ndarray, np.ndarray]:
@@ -162,15 +158,6 @@ def problem(
                 usual = MEASURED[k] * (value if prop == "weight" else 1.0)
                 centre[o, k], sd[o, k] = value, np.sqrt(own**2 + usual**2)
                 measured[o, k] = True
-    return _bare(frame, centre, sd, measured)
-
-
-def rebased(frame: Frame, given: Problem) -> Problem:
-    """The problem of the same blocks in another frame, without nuisances."""
-    return _bare(frame, given.centre, given.sd, given.measured)
-
-
-def _bare(frame: Frame, centre: np.ndarray, sd: np.ndarray, measured: np.ndarray) -> Problem:
     weight = np.where(frame.arrays.there > 0, 1 / frame.arrays.sd, 0.0)
     none = Nuisances(np.zeros((int((weight > 0).sum()), 0)))
     return Problem(frame, weight, centre, sd, measured, none)

@@ -1,4 +1,4 @@
-"""Fit every candidate to aligned trials, and realign boundaries that the best one has displaced."""
+"""Fit every candidate to aligned trials, and realign trials none of which seems to fit its task."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.effects import catalogue, forms_of, name_of
 from simgap.effects.base import tips
-from simgap.gap.assemble import Scatter, gap_of, noise_gained, redrawn, scatters
+from simgap.gap.assemble import Scatter, gap_of, redrawn, scatters
 from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import (
@@ -33,17 +33,12 @@ from simgap.gap.problem import (
     limits,
     neutral,
     problem,
-    rebased,
     world_without,
 )
-from simgap.gap.residuals import SURE
 from simgap.progress import Progress, silent
 
-# Each candidate effect fitted separately: all starts of its gridded parameters are screened, the best
-# refined.
+# Each candidate effect fitted separately, from the best start of its gridded parameters.
 
-SCREEN = 2  # numerics: steps before the best start of a form is chosen
-LEADERS = 3  # numerics: starts that take these steps
 PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be fitted
 
 
@@ -81,8 +76,7 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
 
     Starts are ranked by the cost after a linear step in their amplitudes: a frequency cannot be found while
     its oscillation has no size. Properties start at their measured values, as without the effect they may
-    have been pulled far off, and also at those of `healthy`, since displaced fingers may seem to touch
-    blocks.
+    have been pulled far off.
 
     Args:
         given: The problem.
@@ -91,16 +85,13 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     """
     base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_common]
     base[: given.measured.size][given.measured.ravel()] = 0.0
-    drawn = np.abs(healthy.u - base).max() > SURE  # more than the uncertainty of a touch
     effects = (*healthy.effects, key)
-    every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
-    ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
-    if healthy.cost - ranked[0][0] < PROMISING:
-        return fit(given, effects, ranked[0][2], 0, usual)
-    leading = [u for _, u, _ in ranked[:LEADERS]]
-    if len(leading) > 1:
-        leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
-    return fit(given, effects, leading[0], usual=usual)
+    every = starts(given, key, base)
+    stepped = [_linear_step(given, effects, u, usual) for u in every]
+    best = min(range(len(every)), key=lambda k: stepped[k][0])
+    if healthy.cost - stepped[best][0] < PROMISING:
+        return fit(given, effects, every[best], 0, usual)
+    return fit(given, effects, stepped[best][1], usual=usual)
 
 
 def _linear_step(
@@ -125,7 +116,7 @@ def _linear_step(
     return cost, there
 
 
-# Realignment after correction for an effect: late or softened forces displace the boundaries themselves.
+# Realignment after correction for an effect: forces displaced by a fault may look like another task.
 
 
 def realigned(aligned: AlignedTrials, given: Problem, found: Fitted, all_fit: bool = False) -> AlignedTrials:
@@ -154,23 +145,9 @@ def _hand(rig: Rig, world) -> Rig:
     return rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
 
 
-def moved(before: AlignedTrials, after: AlignedTrials) -> float:
-    """Largest shift of a boundary [s]; infinite if a trial no longer fits its task."""
-    shifts = []
-    for a, b in zip(before.trials, after.trials, strict=True):
-        if not b.segmentation.complete:
-            return float("inf")
-        shifts += [
-            abs(p.quantile(0.5) - q.quantile(0.5)) for p, q in zip(a.boundaries, b.boundaries, strict=True)
-        ]
-    return max(shifts)
-
-
-SHIFT = 0.008  # chosen: s; boundaries that move farther are realigned
 ROUNDS = 2  # numerics: most realignments
 ATTEMPTS = 3  # numerics: leading candidates tried in turn if no trial fits its task
 HOPELESS = 1e4  # chosen: mean square over the noise's; more is another task and no effect of a hand
-WORTH = 50.0  # chosen: nats that a candidate must gain for boundaries to be realigned
 Identified = Mapping[tuple[str, str], float]
 
 
@@ -257,22 +234,13 @@ def search(
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, (), neutral(given))
-    # What moves contacts also moves the moments that turn a block, by as much as these pads let it.
-    given = with_nuisances(given, healthy.u)
-    healthy = fit(given, (), healthy.u)
     fits = [best_fit(given, key, healthy) for key in keys]
     others = redrawn(given)
-    for _ in range(ROUNDS):
-        again = _anew(every, aligned, given, healthy, fits, others)
-        if again is None:
-            break
-        tell("aligning again without the best explanation")
-        aligned, given, healthy, fits = again
-        others = redrawn(given)
     scattering = scatters(given, given.nuisances.left(healthy.residual), names)
     gap = gap_of(given, healthy, fits, scattering, others)
     warnings = [not_compared(trials)] if of_wrist(trials) else []
-    warnings += _failures(every, aligned)
+    failures = [(one.trial.name, one.segmentation.failed) for one in every.trials]
+    warnings += [f"{name}: {why}; left out" for name, why in failures if why is not None]
     return Search(aligned, given, healthy, tuple(fits), tuple(scattering), gap, others,
                   identified, (*misled, *warnings))  # fmt: skip
 
@@ -281,50 +249,6 @@ def _all_measured(aligned: AlignedTrials, actual: dict | None) -> bool:
     """Whether every property was measured apart."""
     given = actual or {}
     return all(kind in given.get(name, {}) for name in aligned.task.objects for kind in PROPERTIES)
-
-
-def _anew(
-    every: AlignedTrials,
-    aligned: AlignedTrials,
-    given: Problem,
-    healthy: Fitted,
-    fits: Sequence[Fitted],
-    others: Sequence[Problem],
-):
-    """Refit everything with boundaries from signals corrected for the best explanation.
-
-    None unless that fits better, or more of all trials (`every`) then fit their task: late, slow or soft
-    contacts displace boundaries, and displaced fingers may look like a dropped block.
-    """
-    best = min(fits, key=lambda f: f.cost)
-    gained = healthy.cost - best.cost
-    if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
-        return None
-    recovered = _recovered(every, aligned, given, best)
-    again = recovered or realigned(aligned, given, best)
-    if recovered is None and not SHIFT < moved(aligned, again) < np.inf:
-        return None
-    other = with_nuisances(rebased(build(again), given), given.nuisances.at)
-    if recovered is None and fit(other, best.effects, best.u).cost / other.size > best.cost / given.size:
-        return None
-    plain = fit(other, (), healthy.u)
-    return again, other, plain, [fit(other, f.effects, f.u, usual=plain.jacobian) for f in fits]
-
-
-def _recovered(
-    every: AlignedTrials, aligned: AlignedTrials, given: Problem, best: Fitted
-) -> AlignedTrials | None:
-    """The trials that fit their task once corrected for the best explanation; None unless these are more."""
-    shown = _shown(every)
-    if len(aligned.trials) >= len(shown):
-        return None
-    forced = align(shown, every.task, every.rig, all_fit=True)
-    frame = build(forced)
-    if not np.isfinite(frame.world.events).all():  # no block is held anywhere
-        return None
-    again = realigned(forced, rebased(frame, given), best)
-    fit_now = tuple(one for one in again.trials if one.segmentation.failed is None)
-    return replace(again, trials=fit_now) if len(fit_now) > len(aligned.trials) else None
 
 
 def _shown(aligned: AlignedTrials) -> list[Trial]:
@@ -336,8 +260,6 @@ def _aligned_all(
     failed: AlignedTrials, actual: dict | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
     """Realign trials that all failed, if most fit their task after correction for one of the candidates.
-
-    Forces displaced by a fault may look like another task.
 
     Returns:
         The trials, as they were if no candidate helps, and a warning that names the one that does.
@@ -368,13 +290,3 @@ def _complete(aligned: AlignedTrials) -> AlignedTrials:
         one = aligned.trials[0]
         raise InputError(one.trial.file, str(one.segmentation.failed), "a recording that shows every subtask")
     return replace(aligned, trials=keep)
-
-
-def _failures(every: AlignedTrials, aligned: AlignedTrials) -> list[str]:
-    """A warning for each trial that did not fit its task at first: whether it is left out."""
-    kept, out = {one.trial.name for one in aligned.trials}, []
-    for one in every.trials:
-        if one.segmentation.failed is not None:
-            what = "left out" if one.trial.name not in kept else "without the best explanation it fits"
-            out.append(f"{one.trial.name}: {one.segmentation.failed}; {what}")
-    return out

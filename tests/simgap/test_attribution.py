@@ -252,9 +252,6 @@ def test_a_gap_below_what_matters_is_none_told_with_its_size_and_asks_for_no_hea
     small = attribute(tolerant, healthy(), heldout=False)
     assert small.verdict == "none" and small.small_gap is not None and 0 < small.small_gap.size < 1
     assert not taken and small.detection.resolution == 0
-    # What nuisances hide where they never are is not small.
-    hidden = replace(tolerant, residual=gap.residual + 4.0 * gap.nuisance[:, 0])
-    assert attribute(hidden, heldout=False).verdict != "none"
     found = attribute(replace(gap, tolerance=np.full(n, 0.05)), healthy(), heldout=False)
     assert found.verdict == "named" and len(taken) == 1 and found.detection.resolution == 0.5
 
@@ -443,12 +440,10 @@ def test_what_changes_sign_between_trials_is_no_cause():
     assert attribute(gap).verdict == "unknown"
 
 
-@pytest.mark.parametrize("noise", [1.0, 0.3])
-def test_a_measurement_that_trials_contradict_is_named_though_no_trial_is_predicted_better(noise):
-    """Nor are trials that are quieter than any noise that is allowed for a gap of less than none."""
+def test_a_measurement_that_trials_contradict_is_named_though_no_trial_is_predicted_better():
     rows = rows_of(samples=30)
     column = np.where(rows.channel == 0, 3.0, 0.0)[:, None]  # by one sd of what was measured
-    residual = noise * np.random.default_rng(0).standard_normal(rows.time.size) + 9.0 * column[:, 0]
+    residual = np.random.default_rng(0).standard_normal(rows.time.size) + 9.0 * column[:, 0]
     wrong = linear("measured", column, scale=10.0)
     found = attribute(Gap(rows, residual, column, (wrong, linear("other", column[::-1].copy()))))
     assert (found.verdict, found.causes) == ("named", ("measured",))

@@ -12,7 +12,7 @@ from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms, of_noise, products
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines, spectrum
 from simgap.gap import assemble
-from simgap.gap.assemble import SIZES, carried, gap_of, noise_gained, on_other, redrawn
+from simgap.gap.assemble import SIZES, carried, gap_of, on_other, redrawn
 from simgap.gap.frame import build, without_dropouts
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import fit, neutral, problem
@@ -113,19 +113,6 @@ def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_b
     square = np.square(noise[..., 0] * doubted).sum(0)
     for c in range(1, 10):  # of sensors alone, what is in doubt besides left out; x has its grips' mean taken
         assert square[channel == c].mean() == pytest.approx(1.0, abs=0.2)
-
-
-@double_precision
-def test_pads_that_swallow_noise_gain_what_they_swallow(given):
-    healthy = fit(given, (), neutral(given))
-    stiff = fit(given, ("fingertip_compliance",), healthy.u, 0)
-    u = stiff.u.copy()
-    own = stiff.columns[given.num_common :]
-    u[own[-1]] -= 2.0  # stiffer in shear by two usual deviations
-    stiff = fit(given, ("fingertip_compliance",), u, 0)
-    others = redrawn(given)
-    assert noise_gained(others, healthy, stiff) > 1.0
-    assert noise_gained(others, healthy, healthy) == 0.0
 
 
 @double_precision
