@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hmmseg.errors import InputError
+from simgap.abl import ON
 from simgap.attribution.heldout import (
     POSITIVE,
     RESPONSE,
@@ -294,7 +295,7 @@ def _small(f: Forms, best: Model, by_group: np.ndarray, absorbed: np.ndarray | N
     if small.size >= 1.0:
         return None
     without = fitted(f, ()).x[: f.spectrum.num_nuisances]
-    if chi2.sf(without @ without, without.size) < ALARM:  # they are where they never are
+    if "chi2" not in ON and chi2.sf(without @ without, without.size) < ALARM:  # they are where they never are
         return None
     if absorbed is not None and (np.abs(best.x[: absorbed.size] - without[: absorbed.size]) > absorbed).any():
         return None
@@ -348,7 +349,9 @@ def _examined(
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
-    causes = tuple(j for j in effects if j in scattering or _needed(f, model, j))
+    causes = tuple(
+        j for j in effects if (j in scattering and "scat_needed" not in ON) or _needed(f, model, j)
+    )
     if others is not None:
         causes = _predicting(others, causes)
     share = 1 - explained.remainder
@@ -373,7 +376,7 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
         for j in causes:
             rest = [i for i in causes if i != j]
             gains = others.gains(causes, rest, rest)
-            gained[j] = float(gains.sum() - gains[:-1].max())
+            gained[j] = float(gains.sum() - gains[:-1].max() * ("pred_max" not in ON))
             if rest and not of[j].parameters:
                 feigned = max(of[i].form for i in rest) * others.gain(rest, ())
                 shown = gains.sum() - of[j].evidence
@@ -438,8 +441,8 @@ def _effects(
         own = coordinates(f, model.effects)[j]
         sd = c.scale * np.sqrt(np.diag(model.covariance)[own])
         mean = c.neutral + c.scale * model.x[own]
-        wide = np.hypot(sd, c.scale * RESPONSE * share_of(f, model, j))
-        if examination is not None:  # only examined sets are compared between parts
+        wide = np.hypot(sd, c.scale * RESPONSE * share_of(f, model, j) * ("response" not in ON))
+        if examination is not None and "between" not in ON:  # only examined sets are compared between parts
             wide = np.hypot(wide, c.scale * np.sqrt(_between(f, model, j)))
         out[name] = EffectPosterior(
             chances.get(name, 0.0), share, interval,

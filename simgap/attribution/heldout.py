@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
+from simgap.abl import ON
 from simgap.attribution.posterior import Forms, Model, channel_of, coordinates, fitted, forms, quadratic_forms
 from simgap.bounded import least
 
@@ -185,6 +186,8 @@ class Heldout:
         determined = z - float(np.trace(plain.covariance))
         floor = np.array([*(test.count.sum() for _, test in self.folds), determined])
         shown = np.append(np.repeat((before - floor)[:-1].sum() > 0, len(self.folds)), True)
+        if "shown" in ON:
+            shown = np.ones(len(floor), bool)
         if float(((before - floor) * shown).sum()) <= 0:
             return None
         n, score = float(floor[shown].sum()), self.gain(effects, ())

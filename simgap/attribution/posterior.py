@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit, gammaln
 
+from simgap.abl import ON
 from simgap.attribution.problem import Gap, Spectrum, spectrum
 from simgap.bounded import least
 
@@ -279,7 +280,7 @@ def fitted(f: Forms, effects: tuple[int, ...]) -> Model:
         return f.modes[effects]
     own = quadratic_forms(f, effects)
     modes = [mode(f, own, np.ones(f.count.size))]
-    if effects:
+    if effects and "one_start" not in ON:
         x = np.zeros(own.low.size)
         for j, mine in own.blocks.items():
             c = f.gap.candidates[j]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import expit
 
+from simgap.abl import ON
 from simgap.attribution.posterior import (
     Background,
     Forms,
@@ -52,8 +53,11 @@ def sought(f: Forms) -> list[Model]:
     while True:
         best = max(m.score for m in seen.values())
         ranked = sorted(seen.values(), key=lambda m: -m.score)
-        leading = [alone, *[m for m in ranked if m.score > best - WINDOW][:BEAM]]
-        leading += [m for m in ranked if len(m.effects) == 1][:2]
+        leading = [
+            *([] if "alone" in ON else [alone]),
+            *[m for m in ranked if m.score > best - WINDOW][:BEAM],
+        ]
+        leading += [m for m in ranked if len(m.effects) == 1][: 0 if "singles" in ON else 2]
         todo = [m for m in leading if m.effects not in opened and len(m.effects) < MOST]
         if not todo:
             break
@@ -61,7 +65,11 @@ def sought(f: Forms) -> list[Model]:
             opened.add(m.effects)
             new = [e for e in _neighbours(f, m.effects) if e not in seen and e not in rough]
             likely = [new[k] for k in np.argsort(-screened(f, m, new), kind="stable")[:SHORT]]
-            found = [mode(f, quadratic_forms(f, e), m.precision, steps=SCREEN) for e in likely]
+            found = (
+                [mode(f, quadratic_forms(f, e), m.precision, steps=SCREEN) for e in likely]
+                if "refined" not in ON
+                else [fitted(f, e) for e in likely[:REFINED]]
+            )
             first = sorted(found, key=lambda m: -m.score)[:REFINED]
             seen |= {m.effects: fitted(f, m.effects) for m in first}
             rough |= {*new} - {*seen}

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import expit
 from scipy.stats import chi2, false_discovery_control, norm
 
+from simgap.abl import ON
 from simgap.attribution.posterior import Forms, Model, squares_left
 from simgap.attribution.problem import Rows
 from simgap.attribution.search import Detection
@@ -193,7 +194,7 @@ def alike(sets: Sequence[Explanation], causes: tuple[str, ...]) -> tuple[str, ..
     """
     holding = [one for one in sets if {*causes} <= {*one.effects}]
     best = max(holding, key=lambda one: one.weight)
-    small, partners = {*best.effects} - {*causes}, set[str]()
+    small, partners = {*best.effects} - {*causes} if "small_alike" not in ON else set(), set[str]()
     for one in sets:
         large = {*one.effects} - small
         if one.weight * RULED_OUT > best.weight and len(large) <= len(causes):

@@ -11,6 +11,7 @@ from scipy.fft import dct
 from scipy.stats import norm
 
 from hmmseg.io.rig import Tolerance
+from simgap.abl import ON
 from simgap.attribution.heldout import POSITIVE, RESPONSE
 from simgap.attribution.posterior import STATED
 from simgap.attribution.problem import BANDS, MODELLED, Candidate, Gap, Rows, cosines
@@ -130,6 +131,8 @@ def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
     """Set the noise's standard deviation and shape in each cosine coefficient of the rows' cells."""
     turn, frequency = _places(rows)
     shape = _shape(given, rows, turn)
+    if "level" in ON:
+        return replace(rows, sd=np.sqrt(shape), shape=shape)
     square = cosines(rows, residual[:, None])[0][:, 0] ** 2 / shape
     arrays = given.frame.arrays
     there = given.there
@@ -140,7 +143,7 @@ def with_noise(given: Problem, rows: Rows, residual: np.ndarray) -> Rows:
     variance = shape.copy()
     # Moving hands do more within a sample than differences show: their velocities have another noise.
     for names, at, quiet in (
-        (KINDS[0], True, True), (KINDS[1], still, True), (KINDS[1], ~still, True),
+        (KINDS[0], True, True), *([(KINDS[1], True, True)] if "still" in ON else [(KINDS[1], still, True), (KINDS[1], ~still, True)]),
         (KINDS[2], True, phase == Phase.FREE),
     ):  # fmt: skip
         mine = np.isin(rows.channel, [CHANNELS.index(n) for n in names]) & at
@@ -191,6 +194,8 @@ def _likeliest(turn: np.ndarray, square: np.ndarray) -> tuple[float, float]:
         expected = 2 * np.log(LEVELS)[:, None] + np.log(_density(float(np.mean(turn[mine])), COLOURS))
         # The relative error of the median of n squares is 2.33 / sqrt(n).
         score = score - np.minimum(0.5 * np.square(seen - expected) * mine.sum() / 2.33**2, OUTLIER)
+    if "colour" in ON:
+        score = np.where(COLOURS == 0, score, -np.inf)
     level, colour = np.unravel_index(int(score.argmax()), score.shape)
     return float(LEVELS[level]), float(COLOURS[colour])
 

@@ -14,6 +14,7 @@ from hmmseg.contact.decompose import PROPERTIES, UNITS, subtasks
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
+from simgap.abl import ON
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
 from simgap.attribution.posterior import Forms, Model, fitted, forms
 from simgap.attribution.problem import Candidate, Gap
@@ -392,7 +393,7 @@ def attributed(
     if not forced:
         gap, models = _after_first(found, f, models)
         leading = [c for j in models[0].effects if _shifts_signals(c := gap.candidates[j])]
-        if leading:
+        if leading and "together" not in ON:
             joint = _together(found, leading)
             left = scatters(
                 found.problem, found.problem.nuisances.left(joint.residual),
@@ -412,7 +413,7 @@ def _after_first(found: Search, f: Forms, models: list[Model]) -> tuple[Gap, lis
     gap, best = f.gap, models[0]
     shifting = [j for j in best.effects if _shifts_signals(gap.candidates[j])]
     first = min(shifting, key=lambda j: fitted(f, tuple(i for i in best.effects if i != j)).score, default=-1)
-    if first < 0 or statistic(f, models, (first,)) < NIL:
+    if "after_first" in ON or first < 0 or statistic(f, models, (first,)) < NIL:
         return gap, models
     one = found.fits[first]
     keys = [k for each in found.fits if name_of(k := each.effects[0]) != gap.candidates[first].name]

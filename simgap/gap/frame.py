@@ -19,6 +19,7 @@ from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
 from hmmseg.robust import bridged
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
+from simgap.abl import ON
 from simgap.effects import catalogue, forms_of, free_parameters
 from simgap.effects.base import World
 from simgap.gap.rounding import rounding_error, rounding_step
@@ -118,7 +119,7 @@ def without_dropouts(trial: Trial) -> Trial:
     least, most = np.minimum(pressed[:-2], pressed[2:]), np.maximum(pressed[:-2], pressed[2:])
     held = ((least > LOST * np.nanmax(pressed, initial=0.0)) & (most < 2 * least)).all(axis=1)
     lost = held & (size[1:-1] < LOST * least).any(axis=1)
-    if not lost.any():
+    if not lost.any() or "dropouts" in ON:
         return trial
     gone = np.pad(lost, 1)
     channels = {k: np.where(gone, np.nan, v) if k in FORCE_CHANNELS else v for k, v in trial.channels.items()}
@@ -197,23 +198,30 @@ def trial_arrays(
     # The finger that touches first pushes the block for a while, and so does a closing hand; a carried block
     # swings in the grip as the hand speeds up.
     push = changes(mean_of(signals, "x"), sample["x"] / np.sqrt(2))
+    if "walk" in ON:
+        push = np.zeros_like(push)
     sd = np.hypot(plain, motion_doubt(signals, sample, push, step, group, rig.fingertip))
-    sd[:, FORCES] = np.hypot(sd[:, FORCES], between_samples(t, force, free, edge & carry, boundaries))
-    shaken = _shaken(signals, sample, force, carry, subtask, step, group) / rig.gravity
+    if "unseen" not in ON:
+        sd[:, FORCES] = np.hypot(sd[:, FORCES], between_samples(t, force, free, edge & carry, boundaries))
+    shaken = _shaken(signals, sample, force, carry, subtask, step, group) / rig.gravity * ("shaken" not in ON)
     sd[:, NET] = np.hypot(sd[:, NET], shaken[:, None])
     sd[:, OFFSET] = np.hypot(sd[:, OFFSET], shaken / rig.fingertip.shear_stiffness)
     if trial.inertia is not None:
         sd[:, NET] = np.hypot(sd[:, NET], trial.inertia)
     there[:, np.isin(CHANNELS, absent(trial))] = 0.0
-    there[np.ix_(_struck(force, sample["force"]), np.isin(CHANNELS, ("vx", "vy")))] = 0.0
+    if "struck" not in ON:
+        there[np.ix_(_struck(force, sample["force"]), np.isin(CHANNELS, ("vx", "vy")))] = 0.0
     lone = _one_finger(t, force, subtask, free, boundaries, sample["force"])
-    there[lone, FORCES] = 0.0
-    there[_opening(signals, force, free), GRIP_FORCE] = 0.0
+    if "one_finger" not in ON:
+        there[lone, FORCES] = 0.0
+    if "opening" not in ON:
+        there[_opening(signals, force, free), GRIP_FORCE] = 0.0
     carried = np.array([phase_of(s) == Phase.CARRY for s in steps])
     lifts = carried[1:] != carried[:-1]  # a block leaves or meets a support
     either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
-    there[np.ix_(either, np.isin(CHANNELS, BORNE))] = 0.0
-    if group > 1:  # a mean over a contact change belongs to neither contact
+    if "either" not in ON:
+        there[np.ix_(either, np.isin(CHANNELS, BORNE))] = 0.0
+    if group > 1 and "contact_mean" not in ON:  # a mean over a contact change belongs to neither contact
         there[np.abs(t[:, None] - boundaries).min(axis=1) <= step / 2] = 0.0
     return {
         "t": t,

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from simgap.abl import ON
 from simgap.effects.base import gradient, tips, with_load
 from simgap.gap.frame import CHANNELS
 from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, residual_of, slots
@@ -29,9 +30,11 @@ def with_nuisances(given: Problem, at: np.ndarray | None = None) -> Problem:
     """
     at = given.nuisances.at if at is None else at
     columns = [
-        *_admitted(given, at), *_inertial(given), *_late_rates(given), *_settling(given), *_rounding(given),
+        *_admitted(given, at), *(_inertial(given) if "inertial" not in ON else ()),
+        *(_late_rates(given) if "late_rates" not in ON else ()), *(_settling(given) if "settling" not in ON else ()),
+        *(_rounding(given) if "rounding" not in ON else ()),
     ]  # fmt: skip
-    return replace(given, nuisances=Nuisances(np.concatenate(columns, 1), at))
+    return replace(given, nuisances=Nuisances(np.concatenate([np.zeros((given.size, 0)), *columns], 1), at))
 
 
 def _admitted(given: Problem, at: np.ndarray | None) -> list[np.ndarray]:
@@ -116,8 +119,9 @@ def _settling(given: Problem) -> list[np.ndarray]:
         for m in range(arrays.onehot.shape[2]):
             mine = np.zeros_like(width)
             mine[t] = arrays.onehot[t, :, m]
-            out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., Phase.CARRY]}))
-            for name, share in (("y", 0.5**0.5), ("offset", 2**0.5)):
+            if "swing" not in ON:
+                out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., Phase.CARRY]}))
+            for name, share in (("y", 0.5**0.5), ("offset", 2**0.5)) if "landing" not in ON else ():
                 out.append(_column(given, {name: share * LANDING * mine * arrays.phase[..., Phase.PLACE]}))
     return out
 

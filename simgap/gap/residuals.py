@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from scipy.special import expit
 
 from hmmseg.contact.equations import Pads, block_offset, block_width, block_x, block_y, support_load
+from simgap.abl import ON
 from simgap.effects.base import (
     CREEPING,
     LATE,
@@ -341,13 +342,15 @@ def residuals(
     y = y - np.tan(world.tilt) * (x1 + x2) / 2 - tipped - rise * place
     # Closing fingers push the block and slide on it; it rests only once both hold it.
     lesser = np.minimum(force[..., 0], -force[..., 2])
-    both = firmness(lesser, held, arrays.onehot, CLOSED)
+    both = firmness(lesser, held, arrays.onehot, CLOSED) if "closed" not in ON else 1.0
     closed = firm * both
     still = closed * (arrays.phase[..., Phase.PICKUP] + place)
     there = arrays.there[..., :4]
     weight_of = np.stack([still, closed * world.ground, held, closed * held], -1) * there
     sd = np.sqrt(np.square(noise[..., :4]) + _doubt(world, firm))
     wider = _misread_moment(world, arrays, width, ease, force, sd[..., OFFSET])
+    if "misread" in ON:
+        wider = np.ones_like(wider)
     sd[..., OFFSET] *= wider
     geometry, loose, unseen = in_grip(
         np.stack([x, y, distance, offset], -1) + world.off, weight_of, sd, firm, world, arrays

@@ -15,6 +15,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
+from simgap.abl import ON
 from simgap.attribution.problem import Gap
 from simgap.bounded import least
 from simgap.effect import Parameter
@@ -93,11 +94,15 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     base[: given.measured.size][given.measured.ravel()] = 0.0
     drawn = np.abs(healthy.u - base).max() > SURE  # more than the uncertainty of a touch
     effects = (*healthy.effects, key)
-    every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
+    every = [
+        start
+        for u in (base, healthy.u)[: 1 + (drawn and "both_starts" not in ON)]
+        for start in starts(given, key, u)
+    ]
     ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
-    if healthy.cost - ranked[0][0] < PROMISING:
+    if healthy.cost - ranked[0][0] < PROMISING and "promising" not in ON:
         return fit(given, effects, ranked[0][2], 0, usual)
-    leading = [u for _, u, _ in ranked[:LEADERS]]
+    leading = [u for _, u, _ in ranked[: LEADERS if "leaders" not in ON else 1]]
     if len(leading) > 1:
         leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
     return fit(given, effects, leading[0], usual=usual)
@@ -257,18 +262,20 @@ def search(
     tell("fitting single effects")
     given = with_nuisances(problem(build(aligned), actual, identified))
     healthy = fit(given, (), neutral(given))
-    # What moves contacts also moves the moments that turn a block, by as much as these pads let it.
-    given = with_nuisances(given, healthy.u)
-    healthy = fit(given, (), healthy.u)
+    if (
+        "again" not in ON
+    ):  # What moves contacts also moves the moments that turn a block, by as much as these pads let it.
+        given = with_nuisances(given, healthy.u)
+        healthy = fit(given, (), healthy.u)
     fits = [best_fit(given, key, healthy) for key in keys]
-    others = redrawn(given)
-    for _ in range(ROUNDS):
+    others = redrawn(given) if "carried" not in ON else ()
+    for _ in range(0 if "anew" in ON else ROUNDS):
         again = _anew(every, aligned, given, healthy, fits, others)
         if again is None:
             break
         tell("aligning again without the best explanation")
         aligned, given, healthy, fits = again
-        others = redrawn(given)
+        others = redrawn(given) if "carried" not in ON else ()
     scattering = scatters(given, given.nuisances.left(healthy.residual), names)
     gap = gap_of(given, healthy, fits, scattering, others)
     warnings = [not_compared(trials)] if of_wrist(trials) else []
@@ -298,7 +305,12 @@ def _anew(
     """
     best = min(fits, key=lambda f: f.cost)
     gained = healthy.cost - best.cost
-    if gained < WORTH or gained - noise_gained(others, healthy, best) < WORTH:
+    if (
+        gained < WORTH
+        or "carried" not in ON
+        and "gain_noise" not in ON
+        and gained - noise_gained(others, healthy, best) < WORTH
+    ):
         return None
     recovered = _recovered(every, aligned, given, best)
     again = recovered or realigned(aligned, given, best)

@@ -10,6 +10,7 @@ import numpy as np
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.segmentation.emissions import noise_sd
+from simgap.abl import ON
 
 # Changes between two samples: jumps of velocities and accelerations, blocks pushed by fingers.
 #
@@ -210,15 +211,20 @@ def motion_doubt(
         pad: The fingertip.
     """
     root2, out = np.sqrt(2.0), np.zeros((s.t.size, 10))
-    out[:, 0], out[:, 1], out[:, 3] = NUDGE, ROCKING * push, 2 * ROCKING * push
-    damped = FOAM / step * changes(np.stack([s.fx1, s.fy1, s.fx2, s.fy2], 1), one["force"])
+    rock = ROCKING * push * ("rocking" not in ON)
+    out[:, 0], out[:, 1], out[:, 3] = NUDGE * ("nudge" not in ON), rock, 2 * rock
+    damped = (
+        FOAM * ("foam" not in ON) / step * changes(np.stack([s.fx1, s.fy1, s.fx2, s.fy2], 1), one["force"])
+    )
     normal, shear = damped[:, ::2] / pad.normal_stiffness, damped[:, 1::2] / pad.shear_stiffness
     for channel, each in ((0, normal / 2), (1, shear / 2), (2, normal), (3, shear)):
         out[:, channel] = np.hypot(out[:, channel], each.sum(axis=1))
     for channel, axis in ((4, "x"), (5, "y")):
         place, speed = (mean_of(s, name) for name in (axis, f"v{axis}"))
-        jump = speed_jumps(place, one[axis] / root2, step, group)
-        out[:, channel] = np.hypot(jump, of_a_kink(group)[0] * kinks(speed, one[f"v{axis}"] / root2))
+        jump = speed_jumps(place, one[axis] / root2, step, group) * ("speed_jumps" not in ON)
+        out[:, channel] = np.hypot(
+            jump, ("kinks" not in ON) * of_a_kink(group)[0] * kinks(speed, one[f"v{axis}"] / root2)
+        )
     return out
 
 
@@ -239,5 +245,5 @@ def between_samples(
     step = np.pad(np.abs(np.diff(every, axis=0)), ((2, 2), (0, 0)))
     change = np.max([step[k : k + len(force)] for k in range(4)], axis=0)
     after = free & (np.abs(t[:, None] - boundaries) < FADING).any(axis=1)
-    share = np.where(starting, STARTING, UNSEEN)[:, None]
-    return np.maximum(share * change, FADED * np.abs(every) * after[:, None])
+    share = np.where(starting & ("starting" not in ON), STARTING, UNSEEN)[:, None]
+    return np.maximum(share * change, FADED * ("fading" not in ON) * np.abs(every) * after[:, None])
