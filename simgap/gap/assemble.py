@@ -28,6 +28,7 @@ from simgap.gap.problem import (
     residual_at,
     tolerated,
 )
+from simgap.gap.sensor_noise import MEDIAN
 from simgap.phases import Phase
 
 # Effects that scatter residuals instead of shifting them: the variance they add, and their size.
@@ -120,7 +121,6 @@ COLOURS = np.linspace(0.0, 0.4, 9)  # prior: correlation from sample to sample; 
 NOISE_BANDS = 6  # numerics: bands whose medians are taken
 SLOWEST = 1.0  # chosen: Hz; slower motion shows effects rather than noise
 OUTLIER = 8.0  # chosen: nats; most that a band costs, as an effect may fill it
-MEDIAN = 0.4549  # physics: median of the square of a standard normal number
 FEWEST = 12  # numerics: fewest coefficients of a band
 # numerics: variance of residuals over that of noise alone, above which they do not show the noise
 CLEAN = 1.25

@@ -224,12 +224,12 @@ SLIDE = 2e-3  # prior: m; slip of a pad from one sample to the next
 ANYWHERE = 0.05  # prior: m; sd of the place at which a grip takes its block
 
 
-def firmness(grip: np.ndarray, held: np.ndarray, moves: np.ndarray) -> np.ndarray:
+def firmness(grip: np.ndarray, held: np.ndarray, moves: np.ndarray, loose: float = LOOSE) -> np.ndarray:
     """How surely (T, N) a grip's pads hold the block rather than slide on it while they close or open."""
     mine = moves * held[..., None]
     usual = (grip[:, None] @ mine)[:, 0] / np.maximum(mine.sum(1), 1.0)
-    least = np.maximum(HELD, LOOSE * (moves @ usual[..., None])[..., 0])
-    return expit((grip / least - 1) * USUAL / (1 / LOOSE - 1))
+    least = np.maximum(HELD, loose * (moves @ usual[..., None])[..., 0])
+    return expit((grip / least - 1) * USUAL / (1 / loose - 1))
 
 
 # prior: variances of unseen motion of joints between two samples, as shares of that of anywhere in the dead
@@ -283,6 +283,7 @@ def _wider(values: np.ndarray) -> np.ndarray:
 TOUCH = 2e-5  # numerics: m; the onset of contact is rounded over this depth, below the joints' resolution
 SURE = 4.0  # chosen: sds of the distance by which fingers must be closer than the block's width to touch it
 STANCES = (0.6, 1.0)  # prior: distance between a block's feet over its width; values between are a mixture
+CLOSED = 0.8  # chosen: share of its usual force at which a grip has closed: until then it pushes the block
 
 
 def residuals(
@@ -333,9 +334,13 @@ def residuals(
     load = support_load(weight, force[..., 1] + force[..., 3])
     y = block_y((y1 + y2) / 2, fy1, fy2, pads_give) + sunk(world, load)
     y = y - np.tan(world.tilt) * (x1 + x2) / 2 - tipped - rise * place
-    still = firm * (arrays.phase[..., Phase.PICKUP] + place)
+    # Closing fingers push the block and slide on it; it rests only once both hold it.
+    lesser = np.minimum(force[..., 0], -force[..., 2])
+    both = firmness(lesser, held, arrays.onehot, CLOSED)
+    closed = firm * both
+    still = closed * (arrays.phase[..., Phase.PICKUP] + place)
     there = arrays.there[..., :4]
-    weight_of = np.stack([still, firm * world.ground, held, firm * held], -1) * there
+    weight_of = np.stack([still, closed * world.ground, held, closed * held], -1) * there
     sd = np.sqrt(np.square(noise[..., :4]) + _doubt(world, firm))
     wider = _misread_moment(world, arrays, width, ease, force, sd[..., OFFSET])
     sd[..., OFFSET] *= wider

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -10,13 +11,14 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.segmentation.emissions import noise_sd
 
-# Changes between two samples: jumps of accelerations, blocks pushed by fingers.
+# Changes between two samples: jumps of velocities and accelerations, blocks pushed by fingers.
 #
 # No rule that combines samples reproduces motion that changes faster than they are taken. Its error shows in
 # differences of high order, which are small for smooth motion.
 
 SEEN = 2.0  # prior: sds of a fourth difference below which it is noise
 FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)  # numerics: weights of a fourth difference
+MEDIAN = 0.4549  # physics: median of the square of a standard normal number
 JUMPS = 64  # numerics: moments between two samples that are averaged over
 MOVES = 3.0  # chosen: sds of a difference above which fingers move
 
@@ -27,6 +29,51 @@ def changes(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
     step = np.pad(step, [(1, 1), *[(0, 0)] * (values.ndim - 1)])
     usual = MOVES * np.sqrt(2.0) * noise.reshape(-1, *[1] * (values.ndim - 1))
     return np.maximum(np.maximum(step[:-1], step[1:]) - usual, 0.0)
+
+
+def speed_jumps(place: np.ndarray, noise: np.ndarray, step: float, group: int) -> np.ndarray:
+    """Root mean square error (N,) of the rule for velocities where they jump between samples.
+
+    The jump is read from the fourth difference of the positions, which are much more accurate than
+    velocities: noise of the latter does not hide it. Changes that irregular sample times cause in any motion
+    are no jumps.
+    """
+    bend, speed, norm = np.zeros_like(place), np.zeros_like(place), np.linalg.norm(FOURTH)
+    place = np.nan_to_num(place)
+    bend[2:-2] = np.abs(np.convolve(place, FOURTH, "valid"))
+    speed[1:-1] = np.abs(place[2:] - place[:-2]) / (2 * step)
+    near = np.maximum(np.maximum(bend, np.roll(bend, 1)), np.roll(bend, -1))
+    moving = speed > np.sqrt(np.mean(speed**2))
+    late = 0.0
+    if moving.any():
+        seen = (bend**2 / (MEDIAN * norm**2) - noise**2)[moving]
+        late = max(float(np.median(seen / speed[moving] ** 2)), 0.0)  # s^2; variance of the sample times
+    usual = SEEN * norm * np.sqrt(noise**2 + late * speed**2)
+    return _of_a_jump(group) / step * np.sqrt(np.maximum(near**2 - usual**2, 0.0))
+
+
+def _sampled(group: int, *courses: Callable[[np.ndarray], np.ndarray]) -> list[np.ndarray]:
+    """15 samples (JUMPS, 15) of courses about each moment of a jump, means over `group` finer ones.
+
+    Time is in samples from the jump.
+    """
+    when = (np.arange(JUMPS) + 0.5) / JUMPS
+    t = (np.arange(15 * group) - 7 * group + 0.5) / group - when[:, None]
+    return [course(t).reshape(JUMPS, 15, group).mean(2) for course in courses]
+
+
+@cache
+def _of_a_jump(group: int) -> float:
+    """Error of the rule (1, 4, 1) / 6 for velocities at a jump, over the fourth difference of positions.
+
+    Root mean square over the moment of the jump between two samples, each a mean over `group` finer ones.
+    """
+    place, speed = _sampled(group, lambda t: np.maximum(t, 0.0), lambda t: 1.0 * (t > 0))
+    rule = (speed[:, :-2] + 4 * speed[:, 1:-1] + speed[:, 2:]) / 6 - (place[:, 2:] - place[:, :-2]) / 2
+    bend = np.abs(np.stack([np.convolve(row, FOURTH, "valid") for row in place]))
+    bend = np.pad(bend, ((0, 0), (2, 2)))
+    near = np.maximum(np.maximum(bend[:, :-2], bend[:, 2:]), bend[:, 1:-1])
+    return float(np.sqrt(np.square(rule).sum() / np.square(near).sum()))
 
 
 def kinks(speed: np.ndarray, noise: np.ndarray) -> np.ndarray:
@@ -54,10 +101,9 @@ def of_a_kink(group: int) -> tuple[float, float]:
         Those of the rule (1, 4, 1) / 6 for velocities and of slopes from five velocities (times the time
             step).
     """
-    when = (np.arange(JUMPS) + 0.5) / JUMPS  # in samples
-    t = (np.arange(15 * group) - 7 * group + 0.5) / group - when[:, None]
-    ramp = np.maximum(t, 0.0)
-    place, speed, rate = (z.reshape(JUMPS, 15, group).mean(2) for z in (ramp**2 / 2, ramp, 1.0 * (t > 0)))
+    place, speed, rate = _sampled(
+        group, lambda t: np.maximum(t, 0.0) ** 2 / 2, lambda t: np.maximum(t, 0.0), lambda t: 1.0 * (t > 0)
+    )
     mean = (speed[:, 1:-3] + 4 * speed[:, 2:-2] + speed[:, 3:-1]) / 6 - (place[:, 3:-1] - place[:, 1:-3]) / 2
     near, far = speed[:, 3:-1] - speed[:, 1:-3], speed[:, 4:] - speed[:, :-4]
     slope = (4 * near / 2 - far / 4) / 3 - rate[:, 2:-2]
@@ -152,8 +198,8 @@ def motion_doubt(
 ) -> np.ndarray:
     """Standard deviation (N, C) of errors of the residuals' equations, beyond noise.
 
-    Pushed blocks rock, and no rule reproduces velocities whose slope changes within a sample. While pads
-    deform quickly, their damping carries a part of the force.
+    Pushed blocks rock, and no rule reproduces velocities that change within a sample, such as that of a
+    released fingertip. While pads deform quickly, their damping carries a part of the force.
 
     Args:
         s: Task-space signals.
@@ -170,7 +216,9 @@ def motion_doubt(
     for channel, each in ((0, normal / 2), (1, shear / 2), (2, normal), (3, shear)):
         out[:, channel] = np.hypot(out[:, channel], each.sum(axis=1))
     for channel, axis in ((4, "x"), (5, "y")):
-        out[:, channel] = of_a_kink(group)[0] * kinks(mean_of(s, f"v{axis}"), one[f"v{axis}"] / root2)
+        place, speed = (mean_of(s, name) for name in (axis, f"v{axis}"))
+        jump = speed_jumps(place, one[axis] / root2, step, group)
+        out[:, channel] = np.hypot(jump, of_a_kink(group)[0] * kinks(speed, one[f"v{axis}"] / root2))
     return out
 
 

@@ -13,7 +13,7 @@ from simgap.gap.assemble import scatters
 from simgap.gap.frame import CHANNELS, _struck, build
 from simgap.gap.problem import fit, neutral, problem, residual_at, residual_of
 from simgap.gap.residuals import fivepoint
-from simgap.gap.sensor_noise import changes, kinks, of_a_kink
+from simgap.gap.sensor_noise import changes, kinks, of_a_kink, speed_jumps
 from simgap.gap.simulated import performed, recorded
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
@@ -97,6 +97,29 @@ def test_five_samples_give_slopes_to_fourth_order():
     exact = 4 * t**3
     assert np.abs(found[..., 0] - exact)[:, 2:-2].max() < 1e-9 * np.abs(exact).max()
     assert np.abs(three[..., 0] - exact)[:, 2:-2].max() > 1e-6 * np.abs(exact).max()
+
+
+def test_a_jump_of_speed_is_in_doubt_and_noise_is_not():
+    rng, step = np.random.default_rng(0), 0.05
+    sd = np.full(4000, 3e-5)
+    assert (speed_jumps(sd * rng.standard_normal(4000), sd, step, 1) > 0).mean() < 0.14  # largest of three
+    t = step * np.arange(40)
+    doubt = speed_jumps(0.2 * np.maximum(t - 0.975, 0.0), sd[:40], step, 1)
+    assert doubt[19] > 0.005 and doubt[20] > 0.005 and not doubt[:16].any() and not doubt[24:].any()
+    irregular = step * np.arange(400) + 0.004 * rng.standard_normal(400)
+    assert (speed_jumps(0.1 * np.sin(irregular), sd[:400], step, 1) > 0).mean() < 0.25
+    assert (speed_jumps(np.full(40, np.nan), sd[:40], step, 1) == 0).all()
+
+
+def test_the_doubt_of_a_jump_is_as_large_as_the_rule_is_off():
+    step, found = 0.05, []
+    for when in np.linspace(0.95, 1.0, 21):
+        t = step * np.arange(40)
+        place, speed = np.maximum(t - when, 0.0), 1.0 * (t > when)
+        rule = (speed[:-2] + 4 * speed[1:-1] + speed[2:]) / 6 - (place[2:] - place[:-2]) / (2 * step)
+        found.append((np.sum(rule**2), np.sum(speed_jumps(place, np.full(40, 1e-9), step, 1) ** 2)))
+    off, doubt = np.sqrt(np.mean(found, axis=0))
+    assert doubt == pytest.approx(off, rel=0.15)
 
 
 @pytest.mark.parametrize("group", [1, 4])
