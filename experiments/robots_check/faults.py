@@ -172,7 +172,7 @@ FAULTS: dict[str, Kind] = {
     "read_lag": Kind(
         _read(lambda f, t, q: np.interp(t - f.size, t, q)), (0.006, 0.03), READ, ("readout:q_{j}.lag",)
     ),
-    "cogging": Kind(_cogging, (0.15, 0.5), JOINT, (), outside=True),
+    "cogging": Kind(_cogging, (0.15, 0.5), JOINT, ("joint:{j}.cogging",), outside=True),
     "gusts": Kind(_gusts, (0.15, 0.5), JOINT, (), outside=True),
     "ringing_sensor": Kind(_read(_swinging_read), (0.3, 1.0), READ, (), outside=True),
 }

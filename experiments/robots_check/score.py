@@ -47,9 +47,12 @@ def alarm(one: Mapping[str, Any]) -> bool:
 
 
 def held_back(one: Mapping[str, Any]) -> bool:
-    """Whether a fault of no known kind is called unknown, or its remainder reported."""
-    return one["found"]["verdict"] == "unknown" or (
-        one["found"]["verdict"] != "none" and one["found"]["remainder"] > 0.1
+    """Whether a fault of no known kind is called unknown, or its remainder reported; or it is named, by an
+    effect that was added since."""
+    found = one["found"]
+    return found["verdict"] == "unknown" or (
+        found["verdict"] != "none"
+        and (found["remainder"] > 0.1 or (bool(one["faults"][0]["right"]) and right(one)))
     )
 
 

@@ -38,6 +38,7 @@ from simgap.robots.rows import Phases
 from simgap.robots.search import FittedSet, Search, predicts_better
 from simgap.robots.whiten import covariances
 
+OPEN = 0.1  # chosen: a small cause is kept if it leaves at most this share of what is left without it
 RECORD = (
     0.92  # learned: 24 of 26 named were right (`experiments.robots_check` and `.given`), all nearly certain
 )
@@ -153,6 +154,8 @@ def verdict_on(
     shares = Shares.of(before, min(after, before), floor, lost, np.random.default_rng(seed))
     gap = _gap(best, nothing)
     large = lost >= LEAST * max(lost.sum(), 1e-12)
+    open_left = max(after - floor, 0.0) + np.sqrt(2 * floor)
+    large |= open_left / (open_left + np.maximum(lost, 1e-12)) <= OPEN
     causes = best.names if forced else tuple(n for n, big in zip(best.names, large, strict=True) if big)
     left = shares.remainder if far is None else max(1.0 - far.fraction, 0.0)
     doubts = _absurd(search.composed.effects, best, causes)
@@ -160,8 +163,10 @@ def verdict_on(
         doubts = (*doubts, f"it leaves {100 * left:.0f} % of the gap")
     right = 0.0 if doubts else known(1.0 - left)
     others = _alternatives(search, best)
-    # What is too small to report is no cause and replaces none.
-    sets = _explanations(others, best, {*best.names} - {*causes}, right)
+    # What is too small to report, and what could replace it, is no cause and replaces none.
+    small = {*best.names} - {*causes}
+    small |= {n for s in others if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
+    sets = _explanations(others, best, small - {*causes}, right)
     matters = (bool(causes) and not doubts) or before > MATTERS * floor
     ordered = tuple(sorted(causes))
     verdict = conclude(sets, gap.p_value, matters, ordered if forced else (), ordered, record=RECORD)
