@@ -165,7 +165,7 @@ class _Squares:
     def residual(self, x: np.ndarray) -> np.ndarray:
         """Whitened residuals and priors; infinite where a window diverges that the linearisation has."""
         mine = np.isfinite(self.linear.residual)
-        found = np.where(mine, self.composed.rows.observed - self.base(x).rows, 0.0)
+        found = np.where(mine, self.linear.target - self.base(x).rows, 0.0)
         white = self.whiten(found) if np.isfinite(found).all() else np.full(found.size, np.inf)
         return np.concatenate([white, _prior(x, self.tails)])
 

@@ -37,14 +37,16 @@ class Moved:
 class Linear:
     """The gap linearised about a point.
 
-    `point`: the point; `rows`: the rows that are compared; `residual`: recorded less simulated values (N,);
-    NaN where a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's
-    start; `moved`: how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number
-    of windows whose rollout diverged; `rates`: rates (N,) of the simulated channels.
+    `point`: the point; `rows`: the rows that are compared; `target`: recorded values (N,), along straight
+    lines as if every window were run from its start; `residual`: these less simulated values (N,); NaN where
+    a rollout diverged; `starts`: derivatives (N,) of the rows by each state of their window's start; `moved`:
+    how effects move the rows; `diverged`: effects whose rollouts diverged; `dropped`: number of windows whose
+    rollout diverged; `rates`: rates (N,) of the simulated channels.
     """
 
     point: Point
     rows: Rows
+    target: np.ndarray
     residual: np.ndarray
     starts: Mapping[str, np.ndarray]
     moved: Mapping[str, Moved]
@@ -95,16 +97,26 @@ def linearise(
     if all(channels is None for channels in base.read):
         raise InputError("simulator", "gives values that are not finite in every window", "finite channels")
     starts = _by_start(composed, base) if starts is None else starts
-    residual, dropped = composed.rows.observed - base.rows, sum(channels is None for channels in base.read)
-    every = {}
+    target = composed.rows.observed + _brought_back(composed, starts)
+    dropped, every = sum(channels is None for channels in base.read), {}
     for number, name in enumerate(effects):
         say(f"{number + 1} of {len(effects)}, {name}")
         every[name] = vary(composed, base, name)
     moved = {n: one for n, one in every.items() if one is not None}
     diverged = tuple(n for n in every if n not in moved)
     return Linear(
-        point, composed.rows, residual, starts, moved, diverged, dropped, _rates(composed, base),
+        point, composed.rows, target, target - base.rows, starts, moved, diverged, dropped,
+        _rates(composed, base),
     )  # fmt: skip
+
+
+def _brought_back(composed: Composed, starts: Mapping[str, np.ndarray]) -> np.ndarray:
+    """How rows (N,) move as windows are run aside of their starts, along straight lines."""
+    out = np.zeros(composed.rows.log.size)
+    for window, mine in zip(composed.windows, composed.rows.of, strict=True):
+        for state, by in window.aside.items():
+            out[mine] += by * starts[state][mine]
+    return out
 
 
 def _rates(composed: Composed, base: Base) -> np.ndarray:

@@ -117,6 +117,11 @@ class Composed:
         """The same with the derivatives by the simulator's own numbers taken at this point."""
         return replace(self, about=dict(point), _slopes={})
 
+    def run_aside(self, asides: Mapping[int, Mapping[str, float]]) -> Composed:
+        """The same with windows, by number, run that far aside of their starts."""
+        windows = [replace(w, aside=asides[k]) if k in asides else w for k, w in enumerate(self.windows)]
+        return replace(self, windows=tuple(windows))
+
     def rolled(self, point: Point, starts: Sequence[Mapping[str, float] | None]) -> list[Channels | None]:
         """Roll out every window.
 
@@ -157,7 +162,7 @@ class Composed:
             now = {**self.effects[name].neutral(), **about.get(name, {})}
             step = known.sd if now[short] + known.sd <= known.high else -known.sd
             there = {**about, name: {**now, short: now[short] + step}}
-            both = [self._rolled(p, new, [w.start for w in new]) for p in (about, there)]
+            both = [self._rolled(p, new, [w.begun() for w in new]) for p in (about, there)]
             for w, here, moved in zip(new, *both, strict=True):
                 change = {} if here is None or moved is None else _sum(moved, here, -1.0)
                 found = {n: v / step for n, v in (change or {}).items()}
@@ -196,10 +201,11 @@ class Composed:
         return out
 
     def starts(self, point: Point) -> list[Mapping[str, float] | None]:
-        """Where every window is run from: smoothed from the recordings with read-out effects undone."""
+        """Where every window is run from: aside of its start, smoothed from the recordings with read-out
+        effects undone."""
         undone = self.unread(point)
         if undone is None:
-            return [w.start for w in self.windows]
+            return [w.begun() for w in self.windows]
         # A start is read column by column; only changed columns are read again.
         changed = [
             {n for n, v in new.columns.items() if v is not old.columns.get(n)}
@@ -208,8 +214,7 @@ class Composed:
         out: list[Mapping[str, float] | None] = []
         for w in self.windows:
             mine = undone[w.log], w.begin, self.noise, w.forward, changed[w.log]
-            anew = {} if w.start is None else start_of(self.simulator, *mine)
-            out.append(None if w.start is None else w.start | {n: v for n, (v, _) in anew.items()})
+            out.append(None if w.start is None else w.begun(start_of(self.simulator, *mine)))
         return out
 
     def unread(self, point: Point) -> list[Recording] | None:

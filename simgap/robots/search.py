@@ -18,6 +18,7 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import t as student
 
+from simgap.attribution.verdict import RULED_OUT
 from simgap.latest import latest
 from simgap.progress import Progress, say
 from simgap.robots.calibrate import Calibration
@@ -35,7 +36,7 @@ from simgap.robots.sets import (
     without,
 )
 from simgap.robots.whiten import ALONE, NONE, Covariances, Discrepancy, Whitener, covariances
-from simgap.robots.windows import STRIKES
+from simgap.robots.windows import JUMPS, STRIKES
 
 EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which sets are scored
@@ -48,6 +49,8 @@ SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
 NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
+SETTLED = 0.3  # numerics: nats to which the leading sets are fitted in the end, as three rule one out
+NEAR_BY = 20.0  # numerics: nats of the best set within which others are fitted to the end
 AGAIN = 4  # numerics: fits of a set, each whitened by what the last one left
 ROUNDS = 12  # numerics: most steps of a search
 BY_CHANCE = 0.05  # chosen: of sets that predict held-out folds no better, the share that may be said to
@@ -137,6 +140,15 @@ class Search:
             other = self._from_calibration()
             if other is not None and self._is_better(other, best):
                 best = self._from(other, tell)
+        return self._settled(best)
+
+    def _settled(self, best: FittedSet) -> FittedSet:
+        """The best set, and those that may be no worse, fitted to the end: three nats rule others out."""
+        near = (s for s in self.fitted.values() if s.promise > best.score - np.log(RULED_OUT))
+        for one in sorted(near, key=lambda one: -one.promise):
+            if one.promise > one.score + SETTLED:
+                self.fit(one.names, one.point, [one.whiten])
+        best = self.fitted[frozenset(best.names)]
         leading = max(self.fitted.values(), key=lambda one: one.score)
         return self._with_less(leading) if self._is_better(leading, best) else best
 
@@ -144,14 +156,14 @@ class Search:
         """A given set at its best."""
         sets, levels = self.propose(self.nothing(), self.wanted)
         _, level, begin = self._likeliest(sets, names)
-        return self._with_less(self.fit(names, begin, levels[level]))
+        return self._with_less(self.fit(names, begin, [levels[level]]))
 
     def _with_less(self, found: FittedSet) -> FittedSet:
         """A set, after all sets with one effect less are fitted, too: they judge what each effect takes."""
         for out in found.names if len(found.names) > 1 else ():
             rest = tuple(n for n in found.names if n != out)
             if frozenset(rest) not in self.fitted:
-                self.fit(rest, without(found.point, out), found.whiten)
+                self.fit(rest, without(found.point, out), [found.whiten])
         return found
 
     def nothing(self) -> FittedSet:
@@ -161,7 +173,7 @@ class Search:
             every = linearise(self.composed, point, [*self.along, *self.wanted])
             self.composed = with_wobble(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
-        return self.fit((), point, covariances(self.composed, linear).whitener())
+        return self.fit((), point, [covariances(self.composed, linear).whitener()])
 
     def _from(self, best: FittedSet, tell: Progress) -> FittedSet:
         """The best set that steps lead to."""
@@ -195,7 +207,7 @@ class Search:
                     sets, levels = self.propose(there, best.names)
                     score, k, begin = self._likeliest(sets, best.names)
                     if score > best.score + NEAR:
-                        best = self.fit(best.names, begin, levels[k], best.score)
+                        best = self.fit(best.names, begin, [levels[k]], best.score)
         return best
 
     def _from_calibration(self) -> FittedSet | None:
@@ -207,12 +219,12 @@ class Search:
             return None
         names = tuple(moved)
         begin = {n: calibrated.get(n, self.composed.effects[n].neutral()) for n in self.along} | moved
-        whole = self.fit(names, begin, self.fitted[frozenset()].covariances.whitener())
+        whole = self.fit(names, begin, [self.fitted[frozenset()].covariances.whitener()])
         if whole.linear.diverged:
             return None
         sets, _ = self.propose(whole, names)
         names = sets.pruned(names, self._likeliest(sets, names)[1])
-        return self.fit(names, self._likeliest(sets, names)[2], whole.whiten)
+        return self.fit(names, self._likeliest(sets, names)[2], [whole.whiten])
 
     def _is_moved(self, name: str, values: Mapping[str, float]) -> bool:
         parameters = self.composed.effects[name].parameters
@@ -223,30 +235,57 @@ class Search:
         score, level = max((float(sets.scores([names], k)[0]), k) for k in range(len(sets.gram)))
         return score, level, point_of(self.composed.effects, sets.fit(names, level), names, self.along)
 
-    def fit(self, names: Names, begin: Point, whiten: Whitener, rival: float = -np.inf) -> FittedSet:
+    def fit(
+        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
+    ) -> FittedSet:
         """Fit a set exactly, and remember it at its best.
 
         Args:
             names: The set.
             begin: Where the fit begins.
-            whiten: Whitens the first fit; later ones are whitened by what the set leaves itself, as long as
-                the closed form promises more.
+            scales: Whiteners of the first fit. Later fits are whitened by what the set leaves itself, and run
+                from where it puts the starts, as long as the closed form promises more, or is wrong along the
+                starts of a leading set. A fit that stays behind the rival is begun anew with the next scale.
             rival: Log evidence [nats] of the set to beat.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
-        here, key = self.composed.moved(begin), frozenset(names)
-        one = self._judge(here, names, fit_effects(here, linearise(here, begin, [], {}), whiten, begin))
-        for _ in range(AGAIN):
-            before, there = one.score, one.composed.moved(one.point)
-            if one.promise < max(before + BETTER, rival - NEAR):
+        here, best, key = self.composed.moved(begin), None, frozenset(names)
+        for whiten in scales:
+            one = self._judge(here, names, self._fit_point(here, begin, whiten))
+            for _ in range(AGAIN):
+                before, (there, linear, bend) = one.score, self._begun_anew(one)
+                leading = max((known.score for known in self.fitted.values()), default=before)
+                bent = bend > BETTER and before + bend > leading - NEAR_BY
+                if not bent and one.promise < max(before + BETTER, rival - NEAR):
+                    break
+                again = self._judge(there, names, fit_effects(there, linear, one.whiten, one.point))
+                one = max((one, again), key=lambda fitted: fitted.score)
+                if one.score < before + BETTER:
+                    break
+            best = one if best is None or one.score > best.score else best
+            if best.score >= rival - NEAR:
                 break
-            again = self._judge(there, names, fit_effects(there, one.linear, one.whiten, one.point))
-            one = max((one, again), key=lambda fitted: fitted.score)
-            if one.score < before + BETTER:
-                break
-        if key not in self.fitted or self.fitted[key].score < one.score:
-            self.fitted[key] = one
+        assert best is not None
+        if key not in self.fitted or self.fitted[key].score < best.score:
+            self.fitted[key] = best
         return self.fitted[key]
+
+    def _begun_anew(self, one: FittedSet) -> tuple[Composed, Linear, float]:
+        """The model with windows run from where a set's fit puts their starts, the gap there, and by how much
+        straight lines from where they were run from are wrong there [nats]."""
+        composed, linear, asides = one.composed, one.linear, {}
+        for k, sizes in one.covariances.starts(one.whiten, np.nan_to_num(linear.residual)).items():
+            away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
+            asides[k] = {n: float(doubt * size) for (n, doubt), size in away if n != JUMPS}
+        if not any(asides.values()):
+            return composed.moved(one.point), linear, 0.0
+        there = composed.run_aside(asides)
+        anew = linearise(there, one.point, [], linear.starts)
+        off = one.whiten(np.nan_to_num(anew.residual - linear.residual))
+        return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
+
+    def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
+        return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).
@@ -366,8 +405,8 @@ class Search:
             begin = point_of(self.composed.effects, sets.fit(names, level[k]), names, self.along)
             if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                 continue
-            rival = -np.inf if learns else best.score
-            one, tried = self.fit(names, begin, levels[level[k]], rival), tried + 1
+            scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
+            one, tried = self.fit(names, begin, scales, -np.inf if learns else best.score), tried + 1
             wrong = max(wrong, one.score - best.score - promised[k])
             if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
                 least = max(least, -NEAR - wrong)
@@ -410,7 +449,7 @@ class Search:
         """A better set without one of the best's causes, or with replacements for one."""
         for out in best.names:
             rest = tuple(n for n in best.names if n != out)
-            less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), best.whiten)
+            less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), [best.whiten])
             if less.linear.diverged:  # nothing can be proposed about it
                 continue
             there = less if self._is_better(less, best) else self._find_better(less, best)
@@ -427,14 +466,22 @@ def _prior_constants(sizes: Sequence[int]) -> float:
 def predicts_better(gain: np.ndarray) -> bool:
     """Whether a set predicts held-out folds better than a rival.
 
-    The gains must be consistent between folds, by a one-sided t test. Gains beyond a nat count by their
-    logarithm: one log in which a cause shows a hundred times as much as in the others must not make the
-    others' agreement look like scatter. A single fold contradicts nothing.
+    Either the gains are consistent between folds (a one-sided t test), or the folds' odds say so: if the
+    rival were right, ratios of predictive densities would have a mean of 1, and so exceed 20 in at most one
+    of 20 cases (Markov's inequality). As densities are only as good as the discrepancy in them, these odds
+    must hold without the fold that says the most, and no fold may have them against the set. The t test
+    alone rules out next to nothing with two or three logs in some of which a cause hardly shows.
+
+    In the t test gains beyond a nat count by their logarithm: one log in which a cause shows a hundred times
+    as much as in the others must not make the others' agreement look like scatter.
 
     Args:
         gain: Gains (folds,) of log density [nats].
     """
-    return gain.size < 2 or by_chance(np.arcsinh(gain)) < BY_CHANCE
+    odds = -np.log(BY_CHANCE)
+    if gain.size < 2 or (gain.sum() - gain.max() > odds and gain.min() > -odds):
+        return True
+    return by_chance(np.arcsinh(gain)) < BY_CHANCE
 
 
 def by_chance(gains: np.ndarray) -> float:

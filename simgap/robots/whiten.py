@@ -46,6 +46,9 @@ ENOUGH = 40  # numerics: windows from which discrepancies are learned
 BLOCK = 100  # numerics: samples of a channel that are whitened together where there is no start
 SMOOTH = 12  # numerics: smooth directions of a channel in a block
 ALONE = -4.0  # prior: log odds that a window is off for reasons of its own
+# numerics: log variances below a first guess; one source may end in another's place, so the better of two
+# starts is taken
+BELOW = (0.0, 8.0)
 WORTH = 3.0  # chosen: nats that a source must gain to count at all
 # numerics: log variances are found to a hundredth of a nat
 CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
@@ -162,7 +165,9 @@ class Covariances:
         while kept:
             bounds = [(v - 20.0, v + 12.0) for v in x]
             given = {"args": (left, rest, kept), "jac": True, "bounds": bounds, "options": CLOSE}
-            done: Any = minimize(smooth.cost, x, method="L-BFGS-B", **given)
+            begun = [x - below for below in BELOW[: 2 if len(kept) == len(names) else 1]]
+            ended = [minimize(smooth.cost, one, method="L-BFGS-B", **given) for one in begun]
+            done = min(ended, key=lambda one: one.fun)
             without = [
                 smooth.cost(np.delete(done.x, i), left, rest, kept[:i] + kept[i + 1 :])[0] - done.fun
                 for i in range(len(kept))
@@ -188,6 +193,14 @@ class Covariances:
                 for (_, h), b, f in zip(made, self.blocks, factor, strict=True)
             ),
         )
+
+    def starts(self, whiten: Whitener, residual: np.ndarray) -> dict[int, np.ndarray]:
+        """Where a residual (N,) puts the start of every window, in standard deviations (S,) from it."""
+        white = whiten(residual)
+        return {
+            b.window: (inverse @ b.start).T @ white[b.rows]
+            for b, inverse in zip(self.blocks, whiten.inverses, strict=True)
+        }
 
     def outliers(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
         """Windows whose residual (N,) exceeds noise and discrepancy, with the factor of their variance.

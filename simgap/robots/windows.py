@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -40,7 +40,8 @@ class Window:
 
     `log`, `begin`, `end`: number of the log and its rows; `forward`: whether the start is smoothed from later
     samples alone; `start`, `doubt`: its states and their standard deviations; None where the simulator does
-    not restart; `regime`: one of REGIMES, where the simulator reports contacts.
+    not restart; `regime`: one of REGIMES, where the simulator reports contacts; `aside`: how far from the
+    start the window is run and linearised, by state.
     """
 
     log: int
@@ -50,6 +51,14 @@ class Window:
     start: dict[str, float] | None
     doubt: dict[str, float]
     regime: str = FLIES
+    aside: Mapping[str, float] = field(default_factory=dict)
+
+    def begun(self, read: Mapping[str, tuple[float, float]] | None = None) -> dict[str, float] | None:
+        """Where the window is run from; `read`: states that were read anew."""
+        if self.start is None:
+            return None
+        new = {n: v for n, (v, _) in (read or {}).items()}
+        return {n: new.get(n, v) + self.aside.get(n, 0.0) for n, v in self.start.items()}
 
 
 def cut(
