@@ -1,6 +1,7 @@
 """MuJoCo models as simulators: maps, rollouts against closed forms, what is set and taken back, patches."""
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -592,10 +593,11 @@ def test_how_often_a_torque_comes_and_goes_is_read_off_the_logs(scaled):
     q, motor = np.sin(1.7 * t), 0.2 * np.cos(2.9 * t)
     lost = 0.1 * np.sin(7 * q + 1) * (motor if scaled else 0.2)
     torque = motor + lost + 0.01 * q + 0.004 * rng.standard_normal(t.size)
-    motion = Motion({0: q}, {0: np.gradient(q, t)}, {}, {0: torque}, {0: motor})
+    motion = Motion(t, {0: q}, {0: np.gradient(q, t)}, {}, {0: torque}, {0: motor})
     assert periods([motion], 0, scaled) == pytest.approx(7, abs=0.5)
-    still = Motion({0: 0.01 * q}, {0: 0 * q}, {}, {0: torque}, {0: motor})
-    assert not periods([still], 0, scaled)
+    still = Motion(t, {0: 0.01 * q}, {0: 0 * q}, {}, {0: torque}, {0: motor})
+    even = replace(motion, torque={0: motor + 0.004 * rng.standard_normal(t.size)})
+    assert not periods([still], 0, scaled) and not periods([even], 0, scaled)
 
 
 def test_a_law_acts_with_its_own_numbers_where_these_are_as_it_came(files):

@@ -97,13 +97,15 @@ def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
 
 SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic
 OFTEN = 100.0  # limit: periods per turn
+CHANCE = 0.01  # chosen: share of even joints of which waves of torque are candidates
 
 
 def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
     """How often per turn a joint's torque comes and goes most: a wave or, `scaled`, a share of the motor's.
 
     What motors give less what the motion takes, regressed on waves of the joint's angle next to what changes
-    slowly with it (the periodogram of Lomb 1976 and Scargle 1982). 0 where the joint does not turn enough.
+    slowly with it (the periodogram of Lomb 1976 and Scargle 1982). 0 where the joint does not turn enough, or
+    chance alone would show as much: SPAN makes as many samples one.
     """
     q, rate, torque, motor = (
         np.concatenate([getattr(m, name)[joint] for m in motions])
@@ -123,14 +125,17 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
         pair = pair * motor[:, None] if scaled else pair
         pair = pair - basis @ (basis.T @ pair)
         gains.append(float(left @ pair @ np.linalg.lstsq(pair, left, rcond=1e-6)[0]))
-    return float(often[int(np.argmax(gains))])
+    independent = sum(np.ptp(m.t) for m in motions) / SPAN
+    by_chance = often.size * (1 - max(gains) / float(left @ left)) ** (0.5 * independent)
+    return float(often[int(np.argmax(gains))]) if by_chance < CHANCE else 0.0
 
 
 @dataclass(frozen=True)
 class Motion:
-    """By joint, along a log's samples (n,): position, rate, acceleration, the torque that they take, and what
-    motors give there."""
+    """Times (n,) [s] of a log's samples, and by joint position, rate, acceleration, the torque that they take,
+    and what motors give."""
 
+    t: np.ndarray
     position: dict[int, np.ndarray]
     rate: dict[int, np.ndarray]
     acceleration: dict[int, np.ndarray]
@@ -161,7 +166,7 @@ def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
     full, given = (
         {j: np.interp(log.t, log.t[rows], one[rows]) for j, one in each.items()} for each in (torque, motor)
     )
-    return Motion(position, rate, acceleration, full, given)
+    return Motion(log.t, position, rate, acceleration, full, given)
 
 
 def smoothed(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
