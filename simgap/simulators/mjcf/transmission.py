@@ -132,8 +132,10 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
 
 @dataclass(frozen=True)
 class Motion:
-    """Times (n,) [s] of a log's samples; by joint position, rate, acceleration, the torque that they take, and
-    what motors give."""
+    """Times (n,) [s] of a log's samples.
+
+    By joint: position, rate, acceleration, the torque that they take, and what motors give.
+    """
 
     t: np.ndarray
     position: dict[int, np.ndarray]
