@@ -98,7 +98,7 @@ def check_forced(forced: Sequence[str]) -> None:
 # One aligned trial as arrays over its samples: signals, states, noise, and where each equation holds.
 
 CHANNELS = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
-OFFSET, NET, FORCES = 3, slice(6, 8), slice(6, 10)  # physics: places among CHANNELS
+OFFSET, NET, FORCES, GRIP_FORCE = 3, slice(6, 8), slice(6, 10), 8  # physics: places among CHANNELS
 BORNE = ("x", "y", "fx", "fy")  # channels whose equations distinguish a supported block from a lifted one
 LOST = 0.05  # chosen: share of the neighbouring grip forces below which a sample's forces are lost
 MAX_RATE = 30.0  # chosen: Hz; finer samples are averaged first
@@ -208,6 +208,7 @@ def trial_arrays(
     there[np.ix_(_struck(force, sample["force"]), np.isin(CHANNELS, ("vx", "vy")))] = 0.0
     lone = _one_finger(t, force, subtask, free, boundaries, sample["force"])
     there[lone, FORCES] = 0.0
+    there[_opening(signals, force, free), GRIP_FORCE] = 0.0
     carried = np.array([phase_of(s) == Phase.CARRY for s in steps])
     lifts = carried[1:] != carried[:-1]  # a block leaves or meets a support
     either = ((first[lifts] <= t[:, None]) & (t[:, None] <= last[lifts])).any(axis=1)
@@ -276,6 +277,25 @@ def _one_finger(
         unequal = np.abs(change[:, 0] + change[:, 2]) > SURE * np.sqrt(2.0) * sd[mine]
         near = (np.abs(t[mine, None] - boundaries) < FIRST_TOUCH).any(axis=1)
         out[mine] = near & ((touches[:, 0] != touches[:, 1]) | unequal)
+    return out
+
+
+def _opening(signals: Signals, force: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Samples (N,) right after a grip at which the fingers are closer than unloaded pads would be.
+
+    Pads recover late: opening fingers lose the block while they are still closer than it is wide. The
+    distance of unloaded pads is what the grip's own distances extrapolate to at zero force, whatever the
+    pads' stiffness.
+    """
+    out, distance, squeeze = np.zeros(free.size, bool), signals.x2 - signals.x1, force[:, 0] - force[:, 2]
+    for end in np.flatnonzero(free[1:] & ~free[:-1]) + 1:
+        start = 1 + int(np.flatnonzero(free[:end]).max(initial=-1))
+        grip = np.arange(start, end)[np.isfinite(distance[start:end])]
+        if np.unique(squeeze[grip]).size < 2:
+            continue
+        unloaded = np.polyfit(squeeze[grip], distance[grip], 1)[1]
+        nearer = (distance[end:] < unloaded) & free[end:]
+        out[end : end + int(np.argmin(np.append(nearer, False)))] = True
     return out
 
 
