@@ -47,13 +47,9 @@ def alarm(one: Mapping[str, Any]) -> bool:
 
 
 def held_back(one: Mapping[str, Any]) -> bool:
-    """Whether a fault of no known kind is called unknown, or its remainder reported; or it is named, by an
-    effect that was added since."""
-    found = one["found"]
-    return found["verdict"] == "unknown" or (
-        found["verdict"] != "none"
-        and (found["remainder"] > 0.1 or (bool(one["faults"][0]["right"]) and right(one)))
-    )
+    """Whether a fault of no known kind is unknown, its remainder reported, or itself named since."""
+    found, named = one["found"], bool(one["faults"][0]["right"]) and right(one)
+    return found["verdict"] == "unknown" or named or (found["verdict"] != "none" and found["remainder"] > 0.1)
 
 
 def covered(one: Mapping[str, Any]) -> list[bool]:
