@@ -1,5 +1,7 @@
 """Numbers and findings in words: from a diagnosis's JSON alone, old and new."""
 
+import re
+
 import pytest
 
 from hmmseg.numbers import between, estimate, fixed, interval, percent, plain, shown_as
@@ -119,8 +121,8 @@ def test_a_part_of_a_robot_is_told_in_words_with_the_models_own_value():
 
 
 def test_every_part_of_a_model_that_is_offered_has_words_and_a_check():
-    kinds = [
-        f"{kind}.{what.removesuffix('_extra').removesuffix('_speed')}"  # of one effect, joint.stribeck
+    kinds = [  # parts of one effect, joint.stribeck, joint.cogging
+        f"{kind}.{re.sub('_(extra|speed|per_turn|cos|sin)$', '', what)}"
         for kind, (_, known) in KINDS.items() for what in known if kind in ("joint", "actuator")
     ]  # fmt: skip
     for kind in (*kinds, "body.mass", "body.com", "body.payload", "geom.friction"):
