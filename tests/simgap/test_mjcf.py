@@ -393,6 +393,10 @@ def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files, 
     job = Job({}, log.window(60, 90), {"w": left, "w_rate": rate})
     _, *state = found.simulator._states([job], (("joint:right.tie", tie),))[0]
     assert abs(left - right) > 1e-4
+    found.simulator.prepare([Recording("a.csv", t, {"w": 0 * t + left, "u": 0 * u + left})])  # of that name
+    still = Job({}, log.window(60, 90), {"w": left, "w_rate": 0.0})
+    at_rest = found.simulator._states([still], (("joint:right.tie", tie),))[0]
+    assert abs(at_rest[1] - at_rest[2]) < 0.1 * abs(left - right)
     np.testing.assert_allclose(state, [left, right, rate, other], atol=0.02 * abs(left - right))
 
 
@@ -593,11 +597,12 @@ def test_how_often_a_torque_comes_and_goes_is_read_off_the_logs(scaled):
     q, motor = np.sin(1.7 * t), 0.2 * np.cos(2.9 * t)
     lost = 0.1 * np.sin(7 * q + 1) * (motor if scaled else 0.2)
     torque = motor + lost + 0.01 * q + 0.004 * rng.standard_normal(t.size)
-    motion = Motion(t, {0: q}, {0: np.gradient(q, t)}, {}, {0: torque}, {0: motor})
+    motion = Motion(t, np.arange(t.size), {0: q}, {0: np.gradient(q, t)}, {}, {0: torque}, {0: motor})
     assert periods([motion], 0, scaled) == pytest.approx(7, abs=0.5)
-    still = Motion(t, {0: 0.01 * q}, {0: 0 * q}, {}, {0: torque}, {0: motor})
+    still = replace(motion, position={0: 0.01 * q}, rate={0: 0 * q})
     even = replace(motion, torque={0: motor + 0.004 * rng.standard_normal(t.size)})
-    assert not periods([still], 0, scaled) and not periods([even], 0, scaled)
+    exact = replace(motion, torque={0: motor})
+    assert not any(periods([one], 0, scaled) for one in (still, even, exact))
 
 
 def test_a_law_acts_with_its_own_numbers_where_these_are_as_it_came(files):

@@ -206,7 +206,7 @@ class MjcfSimulator:
         """Keep logs to start windows from the model's run of them, where columns do not determine the whole
         state."""
         if self._partial or self._ties:
-            self._logs = {log.name: log for log in recordings}
+            self._logs, self._ran = {log.name: log for log in recordings}, {}
 
     def contacts(self, recording: Recording) -> list[float]:
         """Times [s] at which the set of touching bodies changes along the recorded motion."""

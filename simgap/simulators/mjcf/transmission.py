@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import savgol_filter
 
+from simgap.attribution.verdict import ALARM
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
@@ -96,8 +97,7 @@ def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
 
 
 SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic
-OFTEN = 100.0  # limit: periods per turn
-CHANCE = 0.01  # chosen: share of even joints of which waves of torque are candidates
+OFTEN = 100.0  # limit: periods per turn; at 1 rad/s SPAN smooths what comes as often as that away
 
 
 def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
@@ -108,7 +108,7 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
     chance alone would show as much: SPAN makes as many samples one.
     """
     q, rate, torque, motor = (
-        np.concatenate([getattr(m, name)[joint] for m in motions])
+        np.concatenate([getattr(m, name)[joint][m.rows] for m in motions])
         for name in ("position", "rate", "torque", "motor")
     )
     span = float(np.ptp(q))
@@ -119,25 +119,28 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
     basis = np.linalg.qr(slow / np.maximum(np.abs(slow).max(0), 1e-12))[0]
     left = torque - motor
     left = left - basis @ (basis.T @ left)
-    gains = []
-    for n in often:
+    shares = np.zeros(often.size)
+    for k, n in enumerate(often):
         pair = np.column_stack([np.cos(n * q), np.sin(n * q)])
         pair = pair * motor[:, None] if scaled else pair
         pair = pair - basis @ (basis.T @ pair)
-        gains.append(float(left @ pair @ np.linalg.lstsq(pair, left, rcond=1e-6)[0]))
+        fitted = pair @ np.linalg.lstsq(pair, left, rcond=1e-6)[0]
+        shares[k] = fitted @ fitted / max(float(left @ left), 1e-300)
+    best = int(np.argmax(shares))
     independent = sum(np.ptp(m.t) for m in motions) / SPAN
-    by_chance = often.size * (1 - max(gains) / float(left @ left)) ** (0.5 * independent)
-    return float(often[int(np.argmax(gains))]) if by_chance < CHANCE else 0.0
+    by_chance = often.size * max(1 - shares[best], 0.0) ** (0.5 * independent)
+    return float(often[best]) if by_chance < ALARM else 0.0
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Times (n,) [s] of a log's samples.
+    """Times (n,) [s] of a log's samples, and the rows of which torques are computed, 100 a second at most.
 
     By joint: position, rate, acceleration, the torque that they take, and what motors give.
     """
 
     t: np.ndarray
+    rows: np.ndarray
     position: dict[int, np.ndarray]
     rate: dict[int, np.ndarray]
     acceleration: dict[int, np.ndarray]
@@ -168,7 +171,7 @@ def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
     full, given = (
         {j: np.interp(log.t, log.t[rows], one[rows]) for j, one in each.items()} for each in (torque, motor)
     )
-    return Motion(log.t, position, rate, acceleration, full, given)
+    return Motion(log.t, rows, position, rate, acceleration, full, given)
 
 
 def smoothed(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
