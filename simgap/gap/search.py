@@ -35,10 +35,14 @@ from simgap.gap.problem import (
     problem,
     world_without,
 )
+from simgap.gap.residuals import SURE
 from simgap.progress import Progress, silent
 
-# Each candidate effect fitted separately, from the best start of its gridded parameters.
+# Each candidate effect fitted separately: all starts of its gridded parameters are screened, the best
+# refined.
 
+SCREEN = 2  # numerics: steps before the best start of a form is chosen
+LEADERS = 3  # numerics: starts that take these steps
 PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be fitted
 
 
@@ -76,7 +80,8 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
 
     Starts are ranked by the cost after a linear step in their amplitudes: a frequency cannot be found while
     its oscillation has no size. Properties start at their measured values, as without the effect they may
-    have been pulled far off.
+    have been pulled far off, and also at those of `healthy`, since displaced fingers may seem to touch
+    blocks.
 
     Args:
         given: The problem.
@@ -85,13 +90,16 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     """
     base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_common]
     base[: given.measured.size][given.measured.ravel()] = 0.0
+    drawn = np.abs(healthy.u - base).max() > SURE  # more than the uncertainty of a touch
     effects = (*healthy.effects, key)
-    every = starts(given, key, base)
-    stepped = [_linear_step(given, effects, u, usual) for u in every]
-    best = min(range(len(every)), key=lambda k: stepped[k][0])
-    if healthy.cost - stepped[best][0] < PROMISING:
-        return fit(given, effects, every[best], 0, usual)
-    return fit(given, effects, stepped[best][1], usual=usual)
+    every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
+    ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
+    if healthy.cost - ranked[0][0] < PROMISING:
+        return fit(given, effects, ranked[0][2], 0, usual)
+    leading = [u for _, u, _ in ranked[:LEADERS]]
+    if len(leading) > 1:
+        leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
+    return fit(given, effects, leading[0], usual=usual)
 
 
 def _linear_step(
