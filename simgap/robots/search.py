@@ -207,7 +207,10 @@ class Search:
                     sets, levels = self.propose(there, best.names)
                     score, k, begin = self._likeliest(sets, best.names)
                     if score > best.score + NEAR:
-                        best = self.fit(best.names, begin, [levels[k]], best.score)
+                        fitted = self.fit(best.names, begin, [levels[k]], best.score)
+                        if fitted is best:  # lines from here promise what does not come true
+                            return best
+                        best = fitted
         return best
 
     def _from_calibration(self) -> FittedSet | None:
@@ -253,9 +256,9 @@ class Search:
         for whiten in scales:
             one = self._judge(here, names, self._fit_point(here, begin, whiten))
             for _ in range(AGAIN):
-                before, (there, linear, bend) = one.score, self._begun_anew(one)
-                leading = max((known.score for known in self.fitted.values()), default=before)
-                bent = bend > BETTER and before + bend > leading - NEAR_BY
+                leading = max((one, *self.fitted.values()), key=lambda known: known.score)
+                before, (there, linear, bend) = one.score, self._begun_anew(one, leading)
+                bent = bend > BETTER and before + bend > leading.score - NEAR_BY
                 if not bent and one.promise < max(before + BETTER, rival - NEAR):
                     break
                 again = self._judge(there, names, fit_effects(there, linear, one.whiten, one.point))
@@ -270,9 +273,12 @@ class Search:
             self.fitted[key] = best
         return self.fitted[key]
 
-    def _begun_anew(self, one: FittedSet) -> tuple[Composed, Linear, float]:
+    def _begun_anew(self, one: FittedSet, leading: FittedSet) -> tuple[Composed, Linear, float]:
         """The model with windows run from where a set's fit puts their starts, the gap there, and by how much
-        straight lines from where they were run from are wrong there [nats]."""
+        straight lines from where they were run from are wrong there [nats].
+
+        The judge is what the leading set leaves: what lines are wrong by passes for a set's own discrepancy.
+        """
         composed, linear, asides = one.composed, one.linear, {}
         for k, sizes in one.covariances.starts(one.whiten, np.nan_to_num(linear.residual)).items():
             away = zip(composed.windows[k].doubt.items(), sizes, strict=True)
@@ -281,7 +287,8 @@ class Search:
             return composed.moved(one.point), linear, 0.0
         there = composed.run_aside(asides)
         anew = linearise(there, one.point, [], linear.starts)
-        off = one.whiten(np.nan_to_num(anew.residual - linear.residual))
+        judge = one.covariances.whitener(leading.discrepancy, leading.wide)
+        off = judge(np.nan_to_num(anew.residual - linear.residual))
         return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
 
     def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
@@ -299,7 +306,7 @@ class Search:
         discrepancy = cov.estimate(left)
         whiten = cov.whitener(discrepancy)
         if wide := cov.outliers(whiten, left):
-            discrepancy = cov.estimate(left, wide)
+            discrepancy = cov.estimate(left, wide, discrepancy)
             whiten = cov.whitener(discrepancy, wide)
         sets = self._sets(linear, [whiten], names)
         score = promise = -np.inf
@@ -344,7 +351,8 @@ class Search:
         if not held:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
-        for count in LEADERS:  # where the gap is large, one straight line leads only part of the way
+        # Where the gap is large, one straight line leads only part of the way; it is largest without causes.
+        for count in LEADERS if held else 2 * LEADERS[:1]:
             linear = self._roll_out_leaders(composed, base, linear, sets, held, count)
             sets = self._sets(linear, levels, names)
         return sets, levels

@@ -23,8 +23,8 @@ factor turns rows into innovations: what each says beyond those before it in its
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -38,6 +38,7 @@ from simgap.robots.windows import DOUBT, FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import RATE
 
 dpotrf: Any = lapack.dpotrf  # type: ignore[attr-defined]
+dpotri: Any = lapack.dpotri  # type: ignore[attr-defined]
 dtrtrs: Any = lapack.dtrtrs  # type: ignore[attr-defined]
 dtrtri: Any = lapack.dtrtri  # type: ignore[attr-defined]
 
@@ -50,7 +51,7 @@ ALONE = -4.0  # prior: log odds that a window is off for reasons of its own
 # starts is taken
 BELOW = (0.0, 8.0)
 WORTH = 3.0  # chosen: nats that a source must gain to count at all
-# numerics: log variances are found to a hundredth of a nat
+NOTHING = 0.01  # numerics: nats to which log variances are found
 CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
 
 
@@ -70,6 +71,18 @@ class Source:
         """Add it to a block's covariance, in place."""
         across = self.rows if self.covariance.ndim == 1 else self.rows[:, None]
         total[across, self.rows] += variance * self.covariance
+
+    def over(self, sd: np.ndarray) -> Source:
+        """The same in units of the block's rows' noise, `sd` (n,)."""
+        mine = sd[self.rows]
+        units = mine**2 if self.covariance.ndim == 1 else np.outer(mine, mine)
+        return Source(self.rows, self.covariance / units)
+
+    def along(self, directions: np.ndarray, diagonal: bool = False) -> np.ndarray:
+        """Its covariance (m, m) along the columns of `directions` (n, m), or the variances (m,) alone."""
+        mine = directions[self.rows]
+        told = self.covariance[:, None] * mine if self.covariance.ndim == 1 else self.covariance @ mine
+        return np.sum(mine * told, 0) if diagonal else mine.T @ told
 
 
 @dataclass(frozen=True)
@@ -150,32 +163,39 @@ class Covariances:
             total += float(np.sum(solved_by(factor, sure) ** 2))
         return total
 
-    def estimate(self, residual: np.ndarray, wide: Mapping[int, float] | None = None) -> Discrepancy:
+    def estimate(
+        self,
+        residual: np.ndarray,
+        wide: Mapping[int, float] | None = None,
+        known: Discrepancy | None = None,
+    ) -> Discrepancy:
         """The discrepancy of a residual, by maximum likelihood; none of sources that gain less than WORTH.
 
         Args:
             residual: The residual (N,).
             wide: Windows with a larger variance, and its factor.
+            known: The discrepancy without these windows: the search begins there, and among its sources.
         """
         smooth, names = self._smooth, self.names
         left, rest = smooth.projected(residual, wide or {})
-        kept = list(range(len(names)))
         x = smooth.first_guess(left)
-        plain = smooth.cost(np.zeros(0), left, rest, [])[0]
-        while kept:
+        if known is not None:
+            smooth, names = smooth.among([names.index(n) for n in known]), tuple(known)
+            x = 2 * np.log(np.array([*known.values()]))
+        plain = smooth.cost(np.full(len(names), -np.inf), left, rest)[0]
+        while names:
             bounds = [(v - 20.0, v + 12.0) for v in x]
-            given = {"args": (left, rest, kept), "jac": True, "bounds": bounds, "options": CLOSE}
-            begun = [x - below for below in BELOW[: 2 if len(kept) == len(names) else 1]]
+            given = {"args": (left, rest), "jac": True, "bounds": bounds, "options": CLOSE}
+            begun = [x - below for below in BELOW[: 2 if len(names) == len(self.names) else 1]]
             ended = [minimize(smooth.cost, one, method="L-BFGS-B", **given) for one in begun]
             done = min(ended, key=lambda one: one.fun)
-            without = [
-                smooth.cost(np.delete(done.x, i), left, rest, kept[:i] + kept[i + 1 :])[0] - done.fun
-                for i in range(len(kept))
-            ]
-            least = int(np.argmin(without))
-            if plain - done.fun >= WORTH and without[least] >= WORTH:
-                return {names[k]: float(np.exp(v / 2)) for k, v in zip(kept, done.x, strict=True)}
-            kept, x = kept[:least] + kept[least + 1 :], np.delete(done.x, least)
+            each = np.where(np.eye(len(names), dtype=bool), -np.inf, done.x)
+            without = [smooth.cost(one, left, rest)[0] - done.fun for one in each]
+            if plain - done.fun >= WORTH and min(without) >= WORTH:
+                return {n: float(np.exp(v / 2)) for n, v in zip(names, done.x, strict=True)}
+            # What is next to nothing goes at once, else the source that is needed least.
+            kept = np.flatnonzero(np.array(without) > max(min(without), NOTHING))
+            smooth, names, x = smooth.among(kept), tuple(names[k] for k in kept), done.x[kept]
         return NONE
 
     def whitener(
@@ -266,23 +286,21 @@ class _Smooth:
         scale, basis, parts = [], [], []
         for block in blocks:
             sd = np.sqrt(block.variance)
-            each = np.zeros((len(names), sd.size, sd.size))
-            for k, name in enumerate(names):
-                if name in block.sources:
-                    block.sources[name].add(each[k], 1.0)
-            each /= sd[:, None] * sd
             start = block.start / sd[:, None]
-            tied = [one / np.trace(one) for one in each if np.any(one - np.diag(np.diag(one)))]
-            both = start @ start.T / max(float(np.sum(start**2)), 1e-300) + sum(tied)
+            both = start @ start.T / max(float(np.sum(start**2)), 1e-300)
+            each = [block.sources[n].over(sd) if n in block.sources else None for n in names]
+            for one in each:
+                if one is not None and one.covariance.ndim == 2 and one.rows.size > 1:
+                    one.add(both, 1 / max(float(np.trace(one.covariance)), 1e-300))
             count = min(sd.size, SMOOTH * np.unique(block.channel).size)
             b = np.linalg.eigh(both)[1][:, -count:]
             other = np.eye(sd.size) - b @ b.T
             scale.append(sd)
             basis.append(b)
-            whole = [np.eye(count) + (b.T @ start) @ (b.T @ start).T, *(b.T @ one @ b for one in each)]
-            parts.append(
-                (whole, [np.einsum("ij,jk,ki->i", other, one, other, optimize=True) for one in each])
-            )
+            whole = [np.eye(count) + (b.T @ start) @ (b.T @ start).T]
+            whole += [np.zeros((count, count)) if one is None else one.along(b) for one in each]
+            rest = [np.zeros(sd.size) if one is None else one.along(other, diagonal=True) for one in each]
+            parts.append((whole, rest))
         size = max((b.shape[1] for b in basis), default=0)
         plain = np.tile(np.eye(size), (len(blocks), 1, 1))
         source = np.zeros((len(names), len(blocks), size, size))
@@ -317,28 +335,32 @@ class _Smooth:
             out.append(np.log(max(float(share), 1e-30) / max(len(trace), 1)))
         return np.array(out)
 
-    def cost(
-        self, x: np.ndarray, left: np.ndarray, rest: np.ndarray, kept: list[int]
-    ) -> tuple[float, np.ndarray]:
-        """Minus the log likelihood at log variances (k,) of the `kept` sources, and its gradient (k,)."""
+    def among(self, kept: Sequence[int] | np.ndarray) -> _Smooth:
+        """The same with some of the sources, by number."""
+        return replace(self, source=self.source[kept], white=self.white[kept])
+
+    def cost(self, x: np.ndarray, left: np.ndarray, rest: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus the log likelihood at log variances (K,) of the sources, and its gradient (K,)."""
         variance = np.exp(x)
-        whole = self.plain + np.tensordot(variance, self.source[kept], 1) if kept else self.plain
-        inverse = np.linalg.inv(whole)
+        whole = self.plain + np.tensordot(variance, self.source, 1)
+        inverse, half_logs = _inverted(whole)
         pull = np.einsum("bij,bj->bi", inverse, left)
-        value = 0.5 * float(np.linalg.slogdet(whole)[1].sum() + np.sum(pull * left))
-        slope = (
-            [
-                0.5 * float(np.sum(inverse * s) - np.einsum("bi,bij,bj->", pull, s, pull))
-                for s in self.source[kept]
-            ]
-            if kept
-            else []
-        )
-        white = self.white[kept]
-        own = 1 + variance @ white
+        value = half_logs + 0.5 * float(np.sum(pull * left))
+        slope = np.tensordot(self.source, inverse - pull[:, :, None] * pull[:, None], 3)
+        own = 1 + variance @ self.white
         value += 0.5 * float(self.share @ np.log(own) + np.sum(rest**2 / own))
-        slope = np.array(slope) + 0.5 * white @ (self.share / own - (rest / own) ** 2)
-        return value, variance * slope
+        slope = slope + self.white @ (self.share / own - (rest / own) ** 2)
+        return value, 0.5 * variance * slope
+
+
+def _inverted(matrices: np.ndarray) -> tuple[np.ndarray, float]:
+    """Inverses (B, m, m) of covariances (B, m, m), and the sum of half their log determinants."""
+    upper, half = np.empty_like(matrices), 0.0
+    for one, out in zip(matrices, upper, strict=True):
+        factor = _factored(one)
+        half += float(np.log(np.diag(factor)).sum())
+        out[:] = dpotri(factor, lower=1, overwrite_c=1)[0].T
+    return upper + np.triu(upper, 1).transpose(0, 2, 1), half
 
 
 def _factored(matrix: np.ndarray) -> np.ndarray:
