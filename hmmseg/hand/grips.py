@@ -120,8 +120,8 @@ def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
             seen = (widest + held) / 2, max((widest - held) / np.sqrt(12), _noise(opening))
         width, sd = _with_prior(seen, held)
     start = int(inside[np.argmax(opening[inside] <= width)])
-    after = np.flatnonzero(opening[last : end + 1] > width)
-    stop = int(last + after[0]) if after.size else end + 1
+    # An opening hand may pass the width well before it counts as moving.
+    stop = int(inside[np.flatnonzero(opening[inside] <= width)[-1]]) + 1
     return Grip(start, stop, held, width, sd) if stop - start > 2 else None
 
 

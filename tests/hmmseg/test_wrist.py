@@ -73,6 +73,26 @@ def test_a_recording_may_end_as_it_grips(after):
     assert grip is None or opening[-1] <= grip.width <= 0.05
 
 
+def creeping_grip(creep):
+    """Time and opening of a gripper that closes on something within 1 s, holds it for 3 s, and opens again.
+
+    The opening creeps by so much [m] while it is held.
+    """
+    t = np.arange(0.0, 5.0, 0.01)
+    way = np.clip(t, 0, 1) - np.clip(t - 4, 0, 1)
+    shut = way**3 * (10 - 15 * way + 6 * way**2)
+    return t, 0.08 - 0.03 * shut + creep * np.clip((t - 1) / 3, 0, 1) * (t < 4.0)
+
+
+def test_a_grip_ends_where_the_opening_passes_the_width():
+    """A hand that has opened by less than a tenth of its way counts as standing, but its pads may be off."""
+    t, opening = creeping_grip(0.0)
+    (closing,) = closings(opening)
+    grip = grip_of(t, opening, closing, 2.0, 4000.0)  # the pads give 1 mm
+    assert opening[grip.start] <= grip.width < opening[grip.start - 1]
+    assert opening[grip.stop - 1] <= grip.width < opening[grip.stop]
+
+
 def test_a_grip_force_tells_the_width_and_bounds_friction(performed):
     setup = PLAIN
     rig = wrist_rig(setup, grip_force="grip")
