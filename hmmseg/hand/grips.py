@@ -111,7 +111,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
     low = inside[opening[inside] <= floor + REST * (_ceiling(opening, begun, opened) - floor)]
     held, first, last = float(np.median(opening[low])), int(low[0]), int(low[-1])
     force = np.nan if pressing is None else median_of_known(np.broadcast_to(pressing, t.shape)[low])
-    if np.isfinite(force):
+    if np.isfinite(force) and np.isfinite(stiffness):  # pads of unstated stiffness give, nobody knows how far
         width, sd = held + 2 * force / stiffness, 0.0
     else:
         widest = _fastest(t, opening, begun, first, held)

@@ -93,6 +93,15 @@ def test_a_grip_ends_where_the_opening_passes_the_width():
     assert opening[grip.stop - 1] <= grip.width < opening[grip.stop]
 
 
+@pytest.mark.parametrize("creep", [-2e-4, 2e-4])
+def test_a_grip_force_without_a_stiffness_does_not_tell_the_touch(creep):
+    """Pads that nobody has measured are no rigid ones, of which every creep would be a touch."""
+    t, opening = creeping_grip(creep)
+    (closing,) = closings(opening)
+    grip = grip_of(t, opening, closing, 8.0, np.inf)
+    assert t[grip.start] < 1.1 and t[grip.stop] > 3.9 and grip.width_sd > 1e-4
+
+
 def test_a_grip_force_tells_the_width_and_bounds_friction(performed):
     setup = PLAIN
     rig = wrist_rig(setup, grip_force="grip")
