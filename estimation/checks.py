@@ -100,11 +100,15 @@ def soft_pads(design: Design, rig: Rig) -> list[str]:
         if doubt.odds < CERTAIN:
             continue
         true = getattr(pads, f"{kind}1") * (doubt.share + (1.0 if np.isfinite(stated) else 0.0))
-        seen = f"about {1 / true:.2g} N/m" if true > 0 else "no give at all, or forces that are late"
-        out.append(
-            f"[fingertip] {kind}_stiffness = {stated:g}, but readings within each grip show {seen}: "
-            f"{prop} allow for it"
+        seen = (
+            f"about {float(f'{1 / true:.2g}'):g} N/m"
+            if true > 0
+            else "no give at all, or forces that are late"
         )
+        said = (
+            f"{kind}_stiffness = {stated:g}" if np.isfinite(stated) else f"states no finite {kind}_stiffness"
+        )
+        out.append(f"[fingertip] {said}, but readings within each grip show {seen}: {prop} allow for it")
     return out
 
 
