@@ -349,6 +349,19 @@ def test_a_gripper_that_only_pauses_has_gripped_nothing(performed):
     assert watcher.crossings[0].t > 1.9
 
 
+def test_every_pause_on_the_way_to_a_grip_is_taken_back(performed):
+    """However soon the next pause, or the grip, follows the one that is refuted."""
+    simulated, columns = performed
+    slow = columns | {"gap": columns["gap"].copy()}
+    t, gap = slow["t"], slow["gap"]
+    on_its_way = (t > 6.95) & (t < 9.3)
+    left = 1 - sum(np.clip((t[on_its_way] - at) / 0.4, 0, 1) for at in (7.2, 7.7, 8.2)) / 3
+    gap[on_its_way] += 0.03 * left * np.clip((t[on_its_way] - 6.95) / 0.2, 0, 1)
+    watcher, _, final = follow_wrist(slow, wrist_rig(SETUP))
+    assert final["fits"], final["failed"]
+    assert watcher.crossings[4].t == pytest.approx(simulated.boundaries[4], abs=0.05)
+
+
 def test_a_drifting_sensor_is_told_as_an_uncertain_weight(performed):
     simulated, _ = performed
     setup = Setup(rate=20.0, drift=0.02)
