@@ -19,11 +19,12 @@ def plain_name(
     effect: str, means: Mapping[str, float] | None = None, rig: Mapping[str, Any] | None = None
 ) -> str:
     """Effects joined by +, in plain words; `means` are their parameters, `rig` the model's pads."""
-    texts = []
-    for name in effect.split("+"):
+    texts, names = [], effect.split("+")
+    for name in names:
         called, _, known = _words(name)
         if means and known is not None and known.phrase is not None:
-            called = known.phrase({k.removeprefix(f"{name}."): v for k, v in means.items()}, rig or {})
+            own = {k: v for k, v in means.items() if len(names) == 1 or k.startswith(f"{name}.")}
+            called = known.phrase({k.removeprefix(f"{name}."): v for k, v in own.items()}, rig or {})
         texts.append(called)
     return " and ".join(texts)
 
@@ -253,8 +254,8 @@ def explained(body: Body) -> str:
         ends = between(*(own.get("interval_90") or (None, None)))
         sure = f" (90 % interval {ends})" if ends else ""
         return f"It explains {percent(own['share'])} of the gap{sure}."
-    shares = ", ".join(f"{plain_name(n)} explains {percent(a['share'])}" for n, a in known)
-    return f"Of the gap, {shares}."
+    shares = ", ".join(f"{percent(a['share'])} by {plain_name(n)}" for n, a in known)
+    return f"The gap is explained {shares}."
 
 
 def shrunk(body: Body) -> str:
