@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmmseg.hand.sensing import MIN_ALIVE, ROUNDING
 from hmmseg.hand.signals import grouped
 from hmmseg.levels import SURE
 from hmmseg.robust import coarse_step, median_of_known, white_sd
@@ -157,8 +158,14 @@ def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.nda
 
 
 def _noise(opening: np.ndarray) -> float:
-    """Noise sd [m] of one sample of the opening, that of its rounding to coarse steps included."""
-    return max(white_sd(opening), coarse_step(opening) / np.sqrt(12), 1e-6)
+    """Noise sd [m] of one sample of the opening, that of its rounding to coarse steps included.
+
+    Between the messages of a slower stream it follows lines, which have none: only every so many samples tell
+    how messages scatter.
+    """
+    bends = int(np.sum(np.abs(np.diff(opening, 2)) > ROUNDING * np.ptp(opening)))  # two a message
+    every = round(2 * opening.size / bends) if MIN_ALIVE < bends / 2 < opening.size / 2 else 1
+    return max(white_sd(opening[::every]), coarse_step(opening) / np.sqrt(12), 1e-6)
 
 
 def _with_prior(seen: tuple[float, float], held: float) -> tuple[float, float]:

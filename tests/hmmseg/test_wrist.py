@@ -93,6 +93,18 @@ def test_a_grip_ends_where_the_opening_passes_the_width():
     assert opening[grip.stop - 1] <= grip.width < opening[grip.stop]
 
 
+def test_an_opening_between_slower_messages_shows_no_more_than_they_do():
+    """On lines between them there is no noise, against which theirs would show where the hand lets go."""
+    t, opening = creeping_grip(0.0)
+    rows = np.arange(0.0, t[-1], 0.001)
+    for seed in range(5):
+        noisy = opening + np.random.default_rng(seed).normal(0, 1e-4, t.size)
+        shown = np.interp(rows, t, noisy)
+        own, joined = (grip_of(at, x, closings(x)[0], None, np.inf) for at, x in ((t, noisy), (rows, shown)))
+        assert joined.width_sd == pytest.approx(own.width_sd, rel=0.1)
+        assert joined.width == pytest.approx(own.width, abs=own.width_sd)
+
+
 @pytest.mark.parametrize("creep", [-2e-4, 2e-4])
 def test_a_grip_force_without_a_stiffness_does_not_tell_the_touch(creep):
     """Pads that nobody has measured are no rigid ones, of which every creep would be a touch."""
