@@ -75,12 +75,12 @@ class Features(Brief):
         return (self.force[:, 0] - self.force[:, 2]) / 2
 
     def block_width(self, bias: np.ndarray) -> np.ndarray:
-        """Width of the held block (num_timesteps,) [m]; with rigid pads where a force is missing."""
-        return block_width(self.d, *_pair(self.force - bias, 0, 2), self.pads)
+        """Width of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        return block_width(self.d, *_pair(self.force - bias, 0, 2, -1.0), self.pads)
 
     def block_y(self, bias: np.ndarray) -> np.ndarray:
-        """Height of the held block (num_timesteps,) [m]; with rigid pads where a force is missing."""
-        return block_y(self.y, *_pair(self.force - bias, 1, 3), self.pads)
+        """Height of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        return block_y(self.y, *_pair(self.force - bias, 1, 3, 1.0), self.pads)
 
     @cached_property
     def usual(self) -> dict[str, float]:
@@ -104,10 +104,11 @@ class Features(Brief):
         return carried_force(1.0, np.nan_to_num(self.ay), self.gravity)
 
 
-def _pair(force: np.ndarray, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
-    """Forces of both fingers (num_timesteps,), 0 where either is missing."""
-    there = np.isfinite(force[:, first] + force[:, second])
-    return np.where(there, force[:, first], 0.0), np.where(there, force[:, second], 0.0)
+def _pair(force: np.ndarray, first: int, second: int, sign: float) -> tuple[np.ndarray, np.ndarray]:
+    """Forces of both fingers (num_timesteps,): a missing one is the other times `sign`, 0 without both."""
+    pair = force[:, first], force[:, second]
+    a, b = (np.where(np.isnan(own), sign * other, own) for own, other in (pair, pair[::-1]))
+    return np.nan_to_num(a), np.nan_to_num(b)
 
 
 @dataclass(frozen=True)
