@@ -69,6 +69,14 @@ def test_angles_in_degrees_are_refused_as_in_a_file(run):
     assert run(wild)[0] == 0  # a single row is no unit
 
 
+def test_times_in_ms_are_refused_as_in_a_file(run):
+    cells = [row.split(",", 1) for row in ROWS[1:110]]
+    rows = [f"{1e3 * float(t):g},{rest}" for t, rest in cells]
+    code, _, err = run([ROWS[0], *rows])
+    assert code == 2 and "it looks like ms; expected t = {" in err and 'unit = "ms"' in err
+    assert run([*ROWS[:50], *ROWS[90:150]])[0] == 0  # a gap is no unit
+
+
 def test_a_stream_as_a_spreadsheet_has_it(run):
     """Semicolons, decimal commas, remarks, a row of units and ISO stamps: the answers of the plain stream."""
     plain = run(ROWS[:60])[1]
