@@ -29,7 +29,7 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force, pads_of
 from hmmseg.densities import EDGE, log_between, log_student
-from hmmseg.hand.signals import Signals, group_size, grouped
+from hmmseg.hand.signals import Signals, central_differences, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
 from hmmseg.robust import extent, median_of_known, white_sd
@@ -311,10 +311,8 @@ def thin(
 
 def acceleration(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     """Mean acceleration over neighbouring samples [m/s^2]; NaN where undefined."""
-    out, there = np.full_like(velocity, np.nan), np.flatnonzero(np.isfinite(velocity))
-    if there.size > 2:
-        out[there] = np.gradient(velocity[there], t[there])
-    return out
+    found = central_differences(t, velocity)[0]
+    return found if np.isfinite(velocity).sum() > 2 else np.full_like(velocity, np.nan)
 
 
 def features(signals: Signals, rig: Rig) -> Features:

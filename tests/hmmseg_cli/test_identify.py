@@ -167,7 +167,7 @@ def test_a_rig_that_states_no_stiffness_is_not_said_to_state_rigid_pads(tmp_path
     rig.write_text(re.sub(r"(?m)^(normal|shear)_stiffness.*$", "", text))
     args = (str(NONE / "trial_01.csv"), "--task", str(NONE / "task.toml"), "--rig", str(rig))
     warnings = "; ".join(document("identify", *args, out=tmp_path / "out.json")["warnings"])
-    assert "states no finite stiffness" in warnings and "states no finite normal_stiffness" in warnings
+    assert "rig.toml states none" in warnings and "normal_stiffness is not finite" in warnings
     assert re.search(r"about \d{4} N/m", warnings) and "inf," not in warnings
 
 
