@@ -37,7 +37,7 @@ from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
 TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's width (foam giving late)
-STILL = 0.1  # prior: share of carry samples at which the block is held still
+STILL = 0.1  # prior: share of samples in the air at which the hand stands still
 ONE_FINGER = 0.02  # prior: share of free samples at which only one finger touches
 RUNG = 0.01  # prior: share of free samples at which forces still ring from a contact
 
@@ -148,10 +148,11 @@ def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.n
 
 
 def _log_halting(f: Features, p: Parameters) -> np.ndarray:
-    """Log density ratio of velocities and height of a block held still in the air to one that moves.
+    """Log density ratio of velocities and height of a hand that stands still in the air to one that moves.
 
-    Without it, a halt would pass for a rest on something, which predicts the motion much better. A block that
-    halts stays where it was at the previous sample; its height counts if those of resting blocks do.
+    Without it, a halt would pass for a rest on something, which predicts the motion much better: of a block
+    held up, or of one just as wide as an open hand that waits. What halts stays where it was at the previous
+    sample; its height counts if those of resting blocks do.
     """
     out = np.zeros(f.t.size)
     for name, v, sd in (("vx", f.vx, f.sd_vx), ("vy", f.vy, f.sd_vy)):
@@ -208,6 +209,7 @@ def log_likelihoods(
     force = features.force - parameters.bias
     free = _log_ungripped(force, scale["force"], span["force"], rung)
     free = free + _broad(features, "vx", "vy") + _broad(features, "y") + _broad(features, "d")
+    free = free + np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(features, parameters))
     # All forces of a grip but the net vertical one.
     held = log_between((force[:, 0] - force[:, 2]) / 2, 0.0, span["force"], scale["force"])
     if features.free is not None:

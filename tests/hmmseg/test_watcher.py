@@ -96,6 +96,7 @@ def test_emissions_are_those_off_line():
                 found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
             if step.state == ABOVE_GROUND:
                 found -= np.log(1 - 2 * halt + halt * np.exp(upward) * (1 + np.exp(aside)))
+            if step.state in (FREE, ABOVE_GROUND):
                 found += np.logaddexp(np.log1p(-STILL), np.log(STILL) + more)
             np.testing.assert_allclose(found, expected[n, step.index], rtol=1e-6, atol=1e-6)
 
