@@ -24,6 +24,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.units import UNITS
 from hmmseg.levels import CERTAIN, MOVED
+from hmmseg.numbers import plain
 from hmmseg.segmentation.align import AlignedTrials
 
 NUM_REPLICATES = 400  # numerics: determine a p-value of SMALL to 0.003
@@ -100,11 +101,9 @@ def soft_pads(design: Design, rig: Rig) -> list[str]:
         if doubt.odds < CERTAIN:
             continue
         true = getattr(pads, f"{kind}1") * (doubt.share + (1.0 if np.isfinite(stated) else 0.0))
-        seen = f"about {1 / true:.2g} N/m" if true > 0 else "no give at all, or forces that are late"
-        out.append(
-            f"[fingertip] {kind}_stiffness = {stated:g}, but readings within each grip show {seen}: "
-            f"{prop} allow for it"
-        )
+        seen = f"about {plain(1 / true)} N/m" if true > 0 else "no give at all, or forces that are late"
+        said = f"{kind}_stiffness {f'= {stated:g}' if np.isfinite(stated) else 'is not finite'}"
+        out.append(f"[fingertip] {said}, but readings within each grip show {seen}: {prop} allow for it")
     return out
 
 

@@ -15,7 +15,6 @@ import os
 import shutil
 import sys
 import tempfile
-import tomllib
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -273,9 +272,11 @@ def require_rig(rig: Path | None, trials: Sequence[Path]) -> Path:
 
 def _keys(path: Path | None) -> set[str]:
     """Top-level keys of a TOML file; none if it cannot be read, which its reader reports."""
+    from hmmseg.io.schema import read_toml
+
     try:
-        return set() if path is None else set(tomllib.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError):
+        return set() if path is None else set(read_toml(path))
+    except InputError:
         return set()
 
 

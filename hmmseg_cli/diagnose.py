@@ -168,10 +168,11 @@ def _against(
     from simgap.generic.effects import effects
     from simgap.generic.trials import align, align_block_trials
 
-    hand, every, count = None, distinct_trials([*paths, *against]), len(paths)
+    every, count = distinct_trials([*paths, *against]), len(paths)
     if isinstance(task, BlockTask):
         refuse("goes only with a plain ordered task", {"--model": model_file})
-        hand = read_rig(require_rig(rig_file, paths))
+        rig_file = require_rig(rig_file, paths)
+    hand = None if rig_file is None else read_rig(rig_file)
     ordered = None if isinstance(task, BlockTask) else task
     read = [*read_trials(out, every[:count], hand, ordered), *_simulated(out, every[count:], hand, ordered)]
     with out.progress("diagnosing", total=3) as advance:

@@ -58,8 +58,9 @@ def watch(
             if show is not None:
                 show.close()
         final = watcher.finish()
-        if "fingertip" not in watcher.filter.rig.model_fields_set:
-            out.warn("the rig states no [fingertip]: heights and widths are off by what the pads give")
+        if watcher.filter.rig.fingertip.model_fields_set < {"normal_stiffness", "shear_stiffness"}:
+            out.warn("the rig states no [fingertip] stiffness: heights and widths are off by what the pads "
+                     "give, and boundaries with them; hmmseg segment and identify estimate it")  # fmt: skip
         counts = {key: count for key in COUNTED if (count := watcher.counts[key])}
         out.warn(*rows.notes, *(f"{count} {COUNTED[key]}" for key, count in counts.items()))
         envelope = {"format": "hmmseg.watch/1", "version": hmmseg.__version__, "seed": seed,

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hmmseg.hand.sensing import MIN_ALIVE, ROUNDING
 from hmmseg.hand.signals import grouped
 from hmmseg.levels import SURE
 from hmmseg.robust import coarse_step, median_of_known, white_sd
@@ -111,7 +112,7 @@ def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
     low = inside[opening[inside] <= floor + REST * (_ceiling(opening, begun, opened) - floor)]
     held, first, last = float(np.median(opening[low])), int(low[0]), int(low[-1])
     force = np.nan if pressing is None else median_of_known(np.broadcast_to(pressing, t.shape)[low])
-    if np.isfinite(force):
+    if np.isfinite(force) and np.isfinite(stiffness):  # pads of unstated stiffness give, nobody knows how far
         width, sd = held + 2 * force / stiffness, 0.0
     else:
         widest = _fastest(t, opening, begun, first, held)
@@ -120,8 +121,8 @@ def grip_of(t: np.ndarray, opening: np.ndarray, closing: Closing,
             seen = (widest + held) / 2, max((widest - held) / np.sqrt(12), _noise(opening))
         width, sd = _with_prior(seen, held)
     start = int(inside[np.argmax(opening[inside] <= width)])
-    after = np.flatnonzero(opening[last : end + 1] > width)
-    stop = int(last + after[0]) if after.size else end + 1
+    # An opening hand may pass the width well before it counts as moving.
+    stop = int(inside[np.flatnonzero(opening[inside] <= width)[-1]]) + 1
     return Grip(start, stop, held, width, sd) if stop - start > 2 else None
 
 
@@ -157,8 +158,14 @@ def _coarse(t: np.ndarray, opening: np.ndarray, start: int, stop: int) -> np.nda
 
 
 def _noise(opening: np.ndarray) -> float:
-    """Noise sd [m] of one sample of the opening, that of its rounding to coarse steps included."""
-    return max(white_sd(opening), coarse_step(opening) / np.sqrt(12), 1e-6)
+    """Noise sd [m] of one sample of the opening, that of its rounding to coarse steps included.
+
+    Between the messages of a slower stream it follows lines, which have none: only every so many samples tell
+    how messages scatter.
+    """
+    bends = int(np.sum(np.abs(np.diff(opening, 2)) > ROUNDING * np.ptp(opening)))  # two a message
+    every = round(2 * opening.size / bends) if MIN_ALIVE < bends / 2 < opening.size / 2 else 1
+    return max(white_sd(opening[::every]), coarse_step(opening) / np.sqrt(12), 1e-6)
 
 
 def _with_prior(seen: tuple[float, float], held: float) -> tuple[float, float]:

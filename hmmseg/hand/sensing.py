@@ -236,7 +236,9 @@ def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows
     stuck = np.zeros(values.size, bool)
     standing: dict[float, list[tuple[float, float]]] = {}
     other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
-    rounded = name not in FORCE_CHANNELS and coarse_step(shown) > 0  # and repeats itself at rest
+    each, number = np.unique(shown, return_counts=True)
+    moving = shown[shown != each[number.argmax()]]  # a stuck sensor's one value is no step
+    rounded = name not in FORCE_CHANNELS and coarse_step(moving) > 0  # and repeats itself at rest
     least = _share_of_repeats([seen[f] for f in fellows if f != name], shown.size)  # quick, for most runs
     for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
         value, at = float(shown[start]), there[start : stop + 1]

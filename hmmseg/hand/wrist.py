@@ -375,7 +375,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
             grip[inside] = size * (np.clip(squeeze / whole, 0.05, 1.0) if whole > 1e-6 else 1.0)
         else:
             grip[inside] = squeeze * rig.fingertip.normal_stiffness / 2
-        if rigid:  # the drive yields instead of the pads, and the object has one width
+        if rigid and pressing is None:  # the drive yields instead of the pads, and the object has one width
             shown[inside] = np.maximum(shown[inside], each.width)
     closing = smooth(t, shown, deriv=1) / 2
     channels = {
@@ -401,7 +401,9 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     pace = maximum_filter1d(np.abs(np.gradient(np.nan_to_num(fy), t)), _around(t, pose))
     late = np.sqrt(np.maximum(wrong[:, 1] ** 2 - tool.noise**2, 0)) / np.maximum(pace, tool.noise / step)
     timing = np.minimum(late, pose.window / 2)
-    touch_sd = float(np.hypot(width_error(grips), trial.touch_sd))
+    # A measured force shows what the pads give, so that widths need not rely on the opening at the touch.
+    grips_sd = 0.0 if isinstance(pressing, np.ndarray) else width_error(grips)
+    touch_sd = float(np.hypot(grips_sd, trial.touch_sd))
     return replace(trial, channels=channels, touch_sd=touch_sd, touches=touches, timing=timing, inertia=wrong,
                    free=surely, notes=(*_notes(trial, rig, tool), *strays),
                    hidden={} if pressing is not None else {"friction": HIDDEN_GRIP})  # fmt: skip

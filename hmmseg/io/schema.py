@@ -100,7 +100,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 def read_json(path: str | Path, expected: str) -> dict[str, Any]:
     """Table of a JSON file; InputError naming what was `expected` for an absent or malformed file."""
     try:
-        table = json.loads(Path(path).read_text(encoding="utf-8"))
+        table = json.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(str(path), "no such file", expected) from None
     except (OSError, ValueError, RecursionError) as error:
@@ -115,7 +115,7 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
     if any(len(JOINT.findall(token)) > DEEPEST for token in SEPARATOR.split(text)):
         raise InputError(where, "not valid TOML: nested too deeply")  # tomllib would need gigabytes
     try:
-        return tomllib.loads(text)
+        return tomllib.loads(text.removeprefix("\ufeff"))  # Windows' editors mark UTF-8
     except RecursionError:
         raise InputError(where, "not valid TOML: nested too deeply") from None
     except ValueError as error:  # malformed, or a number of thousands of digits

@@ -218,15 +218,17 @@ def _carry(h, x):
 
 @compiled
 def _held_width(h, x, pads):
-    """Width of the held block [m], with rigid pads where a force is missing."""
-    width = block_width(x.d, _force(h, x, 0), _force(h, x, 2), pads)
+    """Width of the held block [m]; a missing force is the other finger's, without both pads are rigid."""
+    fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
+    width = block_width(x.d, -fx2 if math.isnan(fx1) else fx1, -fx1 if math.isnan(fx2) else fx2, pads)
     return x.d if math.isnan(width) else width
 
 
 @compiled
 def _held_height(h, x, pads):
-    """Height of the held block [m], with rigid pads where a force is missing."""
-    height = block_y(x.y, _force(h, x, 1), _force(h, x, 3), pads)
+    """Height of the held block [m]; with missing forces as for its width."""
+    fy1, fy2 = _force(h, x, 1), _force(h, x, 3)
+    height = block_y(x.y, fy2 if math.isnan(fy1) else fy1, fy1 if math.isnan(fy2) else fy2, pads)
     return x.y if math.isnan(height) else height
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError
-from hmmseg.hand.plausibility import check_angles, check_lengths
+from hmmseg.hand.plausibility import check_angles, check_clock, check_lengths
 from hmmseg.hand.signals import level_row
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
@@ -63,7 +63,7 @@ class Watcher:
         self.counts: Counter[str] = Counter()
         self._mark: Any = None  # snapshot of the start of a wrist gripper's last grip
         self._snapshots: deque[tuple[float, Any]] = deque(maxlen=SNAPSHOTS + 1)
-        self._looked: deque[np.ndarray] = deque(maxlen=3)
+        self._looked: deque[tuple[float, np.ndarray]] = deque(maxlen=3)
         self._ends = np.full((2, 1), np.nan)  # least and greatest of the middle ones
         self._roll = 0.0  # last recorded roll of the hand [rad]
         self._every = max(float(lag), 0.1) / SNAPSHOTS
@@ -106,7 +106,7 @@ class Watcher:
             raise ValueError(f"t: {t}, expected a time in s")
         self.counts["rows"] += 1
         if self.counts["rows"] % JUDGED == 0:
-            self._check_units(row)
+            self._check_units(t, row)
         note = self._take(t, row) if self._wrist is None else self._take_wrist(self._wrist, t, row)
         answer = self.filter.answer()
         answer.note = note
@@ -118,16 +118,21 @@ class Watcher:
             self._roll = float(row[-1])
         return level_row(row[:-1], self._roll) if self._roll else row[:-1]
 
-    def _check_units(self, row: np.ndarray) -> None:
-        """InputError once readings show what no hand does, such as millimetres taken for m."""
-        self._looked.append(row)
-        middle = np.sort(self._looked, axis=0)[len(self._looked) // 2]  # of three: one may be wild
+    def _check_units(self, t: float, row: np.ndarray) -> None:
+        """InputError once readings show what no hand does, such as millimetres taken for m, or ms for s."""
+        self._looked.append((t, row))
+        times, rows = (np.array(each) for each in zip(*self._looked, strict=True))
+        middle = np.sort(rows, axis=0)[len(rows) // 2]  # of three: one may be wild
         self._ends = np.array([np.fmin(self._ends[0], middle), np.fmax(self._ends[1], middle)])
         ends = dict(zip(self.channels, self._ends.T, strict=False))
-        trial, rig = Trial("stream", np.array([0.0, 1.0]), ends), self.filter.rig
-        for found in (*check_lengths(trial, rig), *check_angles(trial, rig)):
+        period = np.diff(times).min(initial=np.inf) / JUDGED  # a gap is in one of two
+        known = times.size == self._looked.maxlen and period > 0
+        trial, rig = Trial("stream", t + np.array([0.0, period if known else 1.0]), ends), self.filter.rig
+        clock = check_clock(trial, rig) if known else []
+        for found in (*clock, *check_lengths(trial, rig), *check_angles(trial, rig)):
             if found.certain:  # which other columns are in this unit may not show yet
-                remedy = f'{found.channel} = {{unit = "..."}} and the like under [columns] in rig.toml'
+                several = f'{found.channel} = {{unit = "..."}} and the like under [columns] in rig.toml'
+                remedy = found.remedy if found in clock else several
                 raise InputError(f"stream: column {found.channel}", found.problem, remedy)
 
     def _take(self, t: float, row: np.ndarray) -> str | None:

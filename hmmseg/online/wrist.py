@@ -97,10 +97,10 @@ class Wrist:
         if self.tool is None and not (opening.number or final):
             self._out = max(self._out, newest - BACKLOG)
             return []
+        self._rewind()  # even where no row is ready: the next grip forgets a refuted one
         until = newest if final else min(newest - (self._window or 0.0), opening.known)
         if not final and until < self._out + BATCH and self._fitted == opening.number:
             return []
-        self._rewind()
         out = self._converted(until)
         self._out = max(self._out, until)
         return out

@@ -29,7 +29,7 @@ import numpy as np
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, SLIDING, Subtask
 from hmmseg.contact.equations import Pads, block_width, block_y, carried_force, pads_of
 from hmmseg.densities import EDGE, log_between, log_student
-from hmmseg.hand.signals import Signals, group_size, grouped
+from hmmseg.hand.signals import Signals, central_differences, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
 from hmmseg.robust import extent, median_of_known, white_sd
@@ -37,7 +37,7 @@ from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
 TOUCHING = 1e-4  # prior: share of gripped samples whose distance is not the block's width (foam giving late)
-STILL = 0.1  # prior: share of carry samples at which the block is held still
+STILL = 0.1  # prior: share of samples in the air at which the hand stands still
 ONE_FINGER = 0.02  # prior: share of free samples at which only one finger touches
 RUNG = 0.01  # prior: share of free samples at which forces still ring from a contact
 
@@ -75,12 +75,12 @@ class Features(Brief):
         return (self.force[:, 0] - self.force[:, 2]) / 2
 
     def block_width(self, bias: np.ndarray) -> np.ndarray:
-        """Width of the held block (num_timesteps,) [m]; with rigid pads where a force is missing."""
-        return block_width(self.d, *_pair(self.force - bias, 0, 2), self.pads)
+        """Width of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        return block_width(self.d, *_pair(self.force - bias, 0, 2, -1.0), self.pads)
 
     def block_y(self, bias: np.ndarray) -> np.ndarray:
-        """Height of the held block (num_timesteps,) [m]; with rigid pads where a force is missing."""
-        return block_y(self.y, *_pair(self.force - bias, 1, 3), self.pads)
+        """Height of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        return block_y(self.y, *_pair(self.force - bias, 1, 3, 1.0), self.pads)
 
     @cached_property
     def usual(self) -> dict[str, float]:
@@ -104,10 +104,11 @@ class Features(Brief):
         return carried_force(1.0, np.nan_to_num(self.ay), self.gravity)
 
 
-def _pair(force: np.ndarray, first: int, second: int) -> tuple[np.ndarray, np.ndarray]:
-    """Forces of both fingers (num_timesteps,), 0 where either is missing."""
-    there = np.isfinite(force[:, first] + force[:, second])
-    return np.where(there, force[:, first], 0.0), np.where(there, force[:, second], 0.0)
+def _pair(force: np.ndarray, first: int, second: int, sign: float) -> tuple[np.ndarray, np.ndarray]:
+    """Forces of both fingers (num_timesteps,): a missing one is the other times `sign`, 0 without both."""
+    pair = force[:, first], force[:, second]
+    a, b = (np.where(np.isnan(own), sign * other, own) for own, other in (pair, pair[::-1]))
+    return np.nan_to_num(a), np.nan_to_num(b)
 
 
 @dataclass(frozen=True)
@@ -147,10 +148,11 @@ def _log_resting(aside: np.ndarray | None, upward: np.ndarray, broad_aside: np.n
 
 
 def _log_halting(f: Features, p: Parameters) -> np.ndarray:
-    """Log density ratio of velocities and height of a block held still in the air to one that moves.
+    """Log density ratio of velocities and height of a hand that stands still in the air to one that moves.
 
-    Without it, a halt would pass for a rest on something, which predicts the motion much better. A block that
-    halts stays where it was at the previous sample; its height counts if those of resting blocks do.
+    Without it, a halt would pass for a rest on something, which predicts the motion much better: of a block
+    held up, or of one just as wide as an open hand that waits. What halts stays where it was at the previous
+    sample; its height counts if those of resting blocks do.
     """
     out = np.zeros(f.t.size)
     for name, v, sd in (("vx", f.vx, f.sd_vx), ("vy", f.vy, f.sd_vy)):
@@ -207,6 +209,7 @@ def log_likelihoods(
     force = features.force - parameters.bias
     free = _log_ungripped(force, scale["force"], span["force"], rung)
     free = free + _broad(features, "vx", "vy") + _broad(features, "y") + _broad(features, "d")
+    free = free + np.logaddexp(np.log1p(-STILL), np.log(STILL) + _log_halting(features, parameters))
     # All forces of a grip but the net vertical one.
     held = log_between((force[:, 0] - force[:, 2]) / 2, 0.0, span["force"], scale["force"])
     if features.free is not None:
@@ -310,10 +313,8 @@ def thin(
 
 def acceleration(t: np.ndarray, velocity: np.ndarray) -> np.ndarray:
     """Mean acceleration over neighbouring samples [m/s^2]; NaN where undefined."""
-    out, there = np.full_like(velocity, np.nan), np.flatnonzero(np.isfinite(velocity))
-    if there.size > 2:
-        out[there] = np.gradient(velocity[there], t[there])
-    return out
+    found = central_differences(t, velocity)[0]
+    return found if np.isfinite(velocity).sum() > 2 else np.full_like(velocity, np.nan)
 
 
 def features(signals: Signals, rig: Rig) -> Features:

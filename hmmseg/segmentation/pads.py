@@ -255,7 +255,7 @@ class Sensing:
             out.append(f"forces {how} {1e3 * self.delay:.0f} ms against positions; boundaries allow for it")
         nominal, found = pads_of(rig).normal1, self.normal
         if abs(found.value - nominal) > max(SURE * found.sd, STIFFNESS_SD * nominal):
-            stated = f"rig.toml says {1e6 * nominal:.0f}" if nominal > 0 else "rig.toml says they are rigid"
+            stated = f"rig.toml says {1e6 * nominal:.0f}" if nominal > 0 else "rig.toml states none"
             out.append(f"the pads give {1e6 * found.value:.0f} um/N along the grip, where {stated}; "
                        "boundaries allow for it")  # fmt: skip
         return tuple(out)

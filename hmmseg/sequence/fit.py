@@ -160,7 +160,7 @@ def label_files(where: Path, trials: Sequence[Trial]) -> dict[str, Any]:
 
 def _boundaries(path: Path) -> list[float | None]:
     try:
-        given = json.loads(path.read_text(encoding="utf-8"))["boundaries"]
+        given = json.loads(path.read_text(encoding="utf-8-sig"))["boundaries"]
         return [None if each is None else float(each) for each in given]
     except (OSError, ValueError, TypeError, KeyError):
         raise InputError(str(path), "cannot be read", '{"boundaries": [times in s]}') from None

@@ -12,6 +12,7 @@ import numpy as np
 from estimation.consistency import check_motion
 from hmmseg.contact.decompose import PROPERTIES, UNITS, subtasks
 from hmmseg.jaxconfig import double_precision
+from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
@@ -198,9 +199,9 @@ def drawn(
 
 
 def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
-    """Median, standard deviation and 90 % interval of draws."""
-    low, high = np.percentile(values, (5, 95))
-    return {"mean": float(np.median(values)), "sd": float(np.std(values)),
+    """Median, standard deviation and 90 % interval of draws; robust, as an inverse has no mean square."""
+    (low, high), middle = np.percentile(values, (5, 95)), float(np.median(values))
+    return {"mean": middle, "sd": robust_sd(values - middle),
             "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align as align_blocks
-from hmmseg.segmentation.spans import Segmentation
+from hmmseg.segmentation.spans import Segmentation, most_telling
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import SequenceModel
 from hmmseg.sequence.segment import segment_sequence
@@ -114,6 +114,9 @@ def align(
     shown = [{s.subtask for s in each.spans} for each in found if each.complete]
     seen = tuple(n for n in task.sequence if n not in task.optional or all(n in names for names in shown))
     warnings, n = list[str](), len(real)
+    if most_telling(found) is not None:
+        text = "boundaries could as well be elsewhere, and the gap with them: see hmmseg segment, and give a"
+        warnings.append(f"{text} --model learned from labels")
     first, second = (_cut(every[part], found[part], warnings, seen) for part in (slice(n), slice(n, None)))
     return Ensembles(seen, channels, first, second, tuple(warnings))
 

@@ -19,11 +19,12 @@ def plain_name(
     effect: str, means: Mapping[str, float] | None = None, rig: Mapping[str, Any] | None = None
 ) -> str:
     """Effects joined by +, in plain words; `means` are their parameters, `rig` the model's pads."""
-    texts = []
-    for name in effect.split("+"):
+    texts, names = [], effect.split("+")
+    for name in names:
         called, _, known = _words(name)
         if means and known is not None and known.phrase is not None:
-            called = known.phrase({k.removeprefix(f"{name}."): v for k, v in means.items()}, rig or {})
+            own = {k: v for k, v in means.items() if len(names) == 1 or k.startswith(f"{name}.")}
+            called = known.phrase({k.removeprefix(f"{name}."): v for k, v in own.items()}, rig or {})
         texts.append(called)
     return " and ".join(texts)
 
@@ -246,15 +247,15 @@ def explained(body: Body) -> str:
     """Share of the gap that the causes explain, if the body has it."""
     parts = [(n, body.get("attribution", {}).get(n)) for n in body["causes"]]
     known = [(n, a) for n, a in parts if a and a.get("share") is not None]
-    if not known:
+    if not known or (body.get("remainder") or {"share": 1.0})["share"] is None:
         return ""
     if len(known) == 1:
         own = known[0][1]
         ends = between(*(own.get("interval_90") or (None, None)))
         sure = f" (90 % interval {ends})" if ends else ""
         return f"It explains {percent(own['share'])} of the gap{sure}."
-    shares = ", ".join(f"{plain_name(n)} explains {percent(a['share'])}" for n, a in known)
-    return f"Of the gap, {shares}."
+    shares = ", ".join(f"{percent(a['share'])} by {plain_name(n)}" for n, a in known)
+    return f"The gap is explained {shares}."
 
 
 def shrunk(body: Body) -> str:
@@ -271,8 +272,10 @@ def shrunk(body: Body) -> str:
 def remains(body: Body) -> list[str]:
     """What no cause explains, in words."""
     rest = body.get("remainder")
-    if not rest or rest.get("share") is None or body["verdict"] == "none" or "changes" in body:
+    if not rest or body["verdict"] == "none" or "changes" in body:
         return []
+    if rest["share"] is None:
+        return ["In all, the gap is no larger than the noise; it shows in single places only."]
     noise = rest.get("rms_over_noise")
     size = f" The whole residual is {plain(noise)} times the noise." if noise else ""
     if body["verdict"] == "unknown":

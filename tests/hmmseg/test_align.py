@@ -1,6 +1,7 @@
 """Whole segmentations against the truth: recordings, and simulated trials under hard conditions."""
 
 import itertools
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -87,6 +88,21 @@ def irregular(trial, rng, share=0.25):
 def test_missing_samples_and_irregular_times(change):
     trials, truth, task, rig = simulated(50.0)
     found = residuals([change(t, np.random.default_rng(0)) for t in trials], truth, task, rig)
+    assert np.abs(found).max() < NEAR
+
+
+@pytest.mark.parametrize("block", ["block1", "block2"])
+def test_an_open_hand_that_waits_as_wide_as_a_block_holds_none(block):
+    """As grippers do that open to round numbers; nothing presses on its fingers."""
+    case = read_case(RECORDINGS / "none_1")
+    (trial,), rig = cartesian(case)
+    now, rng = (trial.t >= 0.6) & (trial.t < 1.4), np.random.default_rng(0)
+    half = tomllib.loads((RECORDINGS / "none_1" / "actual.toml").read_text())[block]["width"]["value"] / 2
+    c, n = dict(trial.channels), int(np.argmax(now))
+    middle = (c["x1"][n] + c["x2"][n]) / 2
+    for name, place in (("x1", middle - half), ("x2", middle + half), ("y1", c["y1"][n]), ("y2", c["y2"][n])):
+        c[name] = np.where(now, place + rng.normal(0, 2.5e-5, now.size), c[name])
+    found = residuals([replace(trial, channels=c)], case.truth[:1], case.task, rig)
     assert np.abs(found).max() < NEAR
 
 

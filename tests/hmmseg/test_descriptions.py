@@ -219,6 +219,8 @@ def test_a_task_refused_with_its_message(table, message):
 
 @pytest.mark.parametrize("read", [read_rig, read_task])
 def test_a_file_that_is_absent_or_malformed(read, tmp_path):
+    (tmp_path / "marked.toml").write_text('sequence = ["a", "b"]', encoding="utf-8-sig")  # by an editor
+    assert read_task(tmp_path / "marked.toml").sequence == ("a", "b")
     (tmp_path / "bad.toml").write_text("moves = [")
     (tmp_path / "latin.toml").write_bytes(b'sequence = ["\xe9"]')
     for name, line in (

@@ -130,6 +130,16 @@ def test_positions_in_coarse_steps_are_told_and_not_taken_for_stuck():
     assert read_trial(CARTESIAN, FREE).step == (0, 0)
 
 
+@pytest.mark.parametrize("name", ["x2", "y1"])
+def test_a_position_stuck_for_most_of_a_recording_is_not_taken_for_coarse_steps(name):
+    values = CARTESIAN[name].copy()
+    values[values.size // 4 :] = values[values.size // 4]
+    table = {k: v for k, v in CARTESIAN.items() if k[0] != "v"} | {name: values}
+    trial = read_trial(table, parse_rig({"noise": {"position": 2e-5}}))
+    assert any(re.match(rf".*: {name} repeats", line) for line in trial.warnings)
+    assert not any("in steps of" in line for line in trial.warnings)
+
+
 @pytest.mark.parametrize(
     ("names", "line"), [({"x2", "y2", "vx2", "vy2", "fx2", "fy2"}, "as all of finger 2"), (set(), "")]
 )

@@ -3,6 +3,7 @@
 import io
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,7 @@ from hmmseg_cli.main import main
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 CASE = RECORDINGS / "paper_blocks"
 TASK, RIG = CASE / "task.toml", CASE / "rig.toml"
+NONE = RECORDINGS / "none_1"
 TRUTH = json.loads((CASE / "truth" / "trial_01.json").read_text())["boundaries"]
 
 
@@ -94,6 +96,7 @@ def test_emissions_are_those_off_line():
                 found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
             if step.state == ABOVE_GROUND:
                 found -= np.log(1 - 2 * halt + halt * np.exp(upward) * (1 + np.exp(aside)))
+            if step.state in (FREE, ABOVE_GROUND):
                 found += np.logaddexp(np.log1p(-STILL), np.log(STILL) + more)
             np.testing.assert_allclose(found, expected[n, step.index], rtol=1e-6, atol=1e-6)
 
@@ -216,6 +219,25 @@ def test_missing_channels_and_rows_of_nothing_pass():
     table[60:63] = np.nan
     lines = follow(watcher, t, table)
     assert lines[-1]["fits"] and json.loads(watcher.finish().line())["fits"]
+
+
+@pytest.mark.parametrize(("name", "measure"), [("fx1", "block_width"), ("fy2", "block_y")])
+def test_a_missing_force_is_taken_to_be_the_other_fingers(name, measure):
+    trial, rig = Trial.read(NONE / "trial_01.csv", NONE / "rig.toml"), Rig.read(NONE / "rig.toml")
+    lost = replace(trial, channels=trial.channels | {name: np.full(trial.t.size, np.nan)})
+    whole, without = (getattr(features(task_space(x, rig), rig), measure)(np.zeros(4)) for x in (trial, lost))
+    assert np.median(np.abs(without - whole)) < 5e-5 < np.quantile(np.abs(trial.channels[name]), 0.9) / 2500
+
+
+def test_a_block_is_not_dropped_where_one_finger_is_not_read():
+    """The other presses as hard: a distance without the pads' give would be that of another block."""
+    watcher, t, table = read(NONE / "trial_01.csv", NONE / "rig.toml")
+    lifted, landed = json.loads((NONE / "truth" / "trial_01.json").read_text())["boundaries"][1:3]
+    gone = (t > lifted + 0.3) & (t < lifted + 0.8 * (landed - lifted))
+    columns = [watcher.channels.index(name) for name in ("fx1", "fy1")]
+    table[np.ix_(gone, columns)] = np.nan
+    lines = follow(watcher, t, table)
+    assert all(line["fits"] for line in lines)
 
 
 def test_memory_and_hypotheses_do_not_grow():
@@ -347,6 +369,19 @@ def test_a_gripper_that_only_pauses_has_gripped_nothing(performed):
     watcher, _, final = follow_wrist(early, wrist_rig(SETUP))
     assert final["fits"], final["failed"]
     assert watcher.crossings[0].t > 1.9
+
+
+def test_every_pause_on_the_way_to_a_grip_is_taken_back(performed):
+    """However soon the next pause, or the grip, follows the one that is refuted."""
+    simulated, columns = performed
+    slow = columns | {"gap": columns["gap"].copy()}
+    t, gap = slow["t"], slow["gap"]
+    on_its_way = (t > 6.95) & (t < 9.3)
+    left = 1 - sum(np.clip((t[on_its_way] - at) / 0.4, 0, 1) for at in (7.2, 7.7, 8.2)) / 3
+    gap[on_its_way] += 0.03 * left * np.clip((t[on_its_way] - 6.95) / 0.2, 0, 1)
+    watcher, _, final = follow_wrist(slow, wrist_rig(SETUP))
+    assert final["fits"], final["failed"]
+    assert watcher.crossings[4].t == pytest.approx(simulated.boundaries[4], abs=0.05)
 
 
 def test_a_drifting_sensor_is_told_as_an_uncertain_weight(performed):

@@ -73,6 +73,47 @@ def test_a_recording_may_end_as_it_grips(after):
     assert grip is None or opening[-1] <= grip.width <= 0.05
 
 
+def creeping_grip(creep):
+    """Time and opening of a gripper that closes on something within 1 s, holds it for 3 s, and opens again.
+
+    The opening creeps by so much [m] while it is held.
+    """
+    t = np.arange(0.0, 5.0, 0.01)
+    way = np.clip(t, 0, 1) - np.clip(t - 4, 0, 1)
+    shut = way**3 * (10 - 15 * way + 6 * way**2)
+    return t, 0.08 - 0.03 * shut + creep * np.clip((t - 1) / 3, 0, 1) * (t < 4.0)
+
+
+def test_a_grip_ends_where_the_opening_passes_the_width():
+    """A hand that has opened by less than a tenth of its way counts as standing, but its pads may be off."""
+    t, opening = creeping_grip(0.0)
+    (closing,) = closings(opening)
+    grip = grip_of(t, opening, closing, 2.0, 4000.0)  # the pads give 1 mm
+    assert opening[grip.start] <= grip.width < opening[grip.start - 1]
+    assert opening[grip.stop - 1] <= grip.width < opening[grip.stop]
+
+
+def test_an_opening_between_slower_messages_shows_no_more_than_they_do():
+    """On lines between them there is no noise, against which theirs would show where the hand lets go."""
+    t, opening = creeping_grip(0.0)
+    rows = np.arange(0.0, t[-1], 0.001)
+    for seed in range(5):
+        noisy = opening + np.random.default_rng(seed).normal(0, 1e-4, t.size)
+        shown = np.interp(rows, t, noisy)
+        own, joined = (grip_of(at, x, closings(x)[0], None, np.inf) for at, x in ((t, noisy), (rows, shown)))
+        assert joined.width_sd == pytest.approx(own.width_sd, rel=0.1)
+        assert joined.width == pytest.approx(own.width, abs=own.width_sd)
+
+
+@pytest.mark.parametrize("creep", [-2e-4, 2e-4])
+def test_a_grip_force_without_a_stiffness_does_not_tell_the_touch(creep):
+    """Pads that nobody has measured are no rigid ones, of which every creep would be a touch."""
+    t, opening = creeping_grip(creep)
+    (closing,) = closings(opening)
+    grip = grip_of(t, opening, closing, 8.0, np.inf)
+    assert t[grip.start] < 1.1 and t[grip.stop] > 3.9 and grip.width_sd > 1e-4
+
+
 def test_a_grip_force_tells_the_width_and_bounds_friction(performed):
     setup = PLAIN
     rig = wrist_rig(setup, grip_force="grip")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -158,6 +159,16 @@ def test_the_papers_method_has_no_evidence_and_its_own_formulas(tmp_path):
     found = document("identify", trial, *RIG_AND_TASK, "--method", "paper", out=tmp_path / "out.json")
     assert found["method"] == "paper" and found["trials"][0]["log_evidence"] is None
     assert found["properties"]["block1"]["width"]["mean"] < 0.0185  # short by what the pads give
+
+
+def test_a_rig_that_states_no_stiffness_is_not_said_to_state_rigid_pads(tmp_path):
+    rig = tmp_path / "rig.toml"
+    text = (NONE / "rig.toml").read_text()
+    rig.write_text(re.sub(r"(?m)^(normal|shear)_stiffness.*$", "", text))
+    args = (str(NONE / "trial_01.csv"), "--task", str(NONE / "task.toml"), "--rig", str(rig))
+    warnings = "; ".join(document("identify", *args, out=tmp_path / "out.json")["warnings"])
+    assert "rig.toml states none" in warnings and "normal_stiffness is not finite" in warnings
+    assert re.search(r"about \d{4} N/m", warnings) and "inf," not in warnings
 
 
 @pytest.mark.slow  # `make wheel` runs it as well

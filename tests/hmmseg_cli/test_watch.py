@@ -69,6 +69,14 @@ def test_angles_in_degrees_are_refused_as_in_a_file(run):
     assert run(wild)[0] == 0  # a single row is no unit
 
 
+def test_times_in_ms_are_refused_as_in_a_file(run):
+    cells = [row.split(",", 1) for row in ROWS[1:110]]
+    rows = [f"{1e3 * float(t):g},{rest}" for t, rest in cells]
+    code, _, err = run([ROWS[0], *rows])
+    assert code == 2 and "it looks like ms; expected t = {" in err and 'unit = "ms"' in err
+    assert run([*ROWS[:50], *ROWS[90:150]])[0] == 0  # a gap is no unit
+
+
 def test_a_stream_as_a_spreadsheet_has_it(run):
     """Semicolons, decimal commas, remarks, a row of units and ISO stamps: the answers of the plain stream."""
     plain = run(ROWS[:60])[1]
@@ -88,8 +96,9 @@ def test_a_stream_as_a_spreadsheet_has_it(run):
     assert code == 2 and "column t: 'morgen" in err
 
 
-def test_a_rig_without_pads_is_told(run, tmp_path):
-    (tmp_path / "rig.toml").write_text(re.sub(r"\[fingertip\][^\[]*", "", (CASE / "rig.toml").read_text()))
+@pytest.mark.parametrize("left_out", [r"\[fingertip\][^\[]*", r"(?m)^(normal|shear)_stiffness.*$"])
+def test_a_rig_without_pads_is_told(run, tmp_path, left_out):
+    (tmp_path / "rig.toml").write_text(re.sub(left_out, "", (CASE / "rig.toml").read_text()))
     code, lines, _ = run(ROWS[:20], "--rig", str(tmp_path / "rig.toml"))
     assert code == 0 and any("states no [fingertip]" in line for line in lines[-1]["warnings"])
 

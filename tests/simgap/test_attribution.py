@@ -216,6 +216,17 @@ def test_one_effect_is_named_with_its_size_and_share():
     assert {(c.channel) for c in found.where} <= {"c0", "c1"}
 
 
+def test_a_gap_that_is_lost_in_the_whole_noise_has_no_share_that_remains():
+    rows, rng = rows_of(channels=1, parts=6), np.random.default_rng(0)
+    calm = rows.part == 0
+    push = rng.standard_normal(rows.time.size) * calm
+    residual = rng.standard_normal(push.size) * np.where(calm, 0.2, 1.5) + 0.6 * push
+    none = np.zeros((push.size, 0))
+    found = attribute(Gap(rows, residual, none, (linear("a", push[:, None]),)), heldout=False)
+    assert found.causes == ("a",) and found.shares.before < found.shares.floor
+    assert found.remainder.share is None
+
+
 def test_rounding_makes_no_probability_larger_than_one():
     alone = fitted(forms(gap_of({1: 9.0})), (1,))
     each = next(w for w in (weights([alone] * n) for n in range(2, 99)) if sum(w) > 1.0)

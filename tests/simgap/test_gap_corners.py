@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import lfilter, lsim
 
 from simgap.effects.base import LATE, SMOOTH, YIELDING
+from simgap.gap.diagnose import _summary
 from simgap.gap.residuals import contact, doubt_between, shifted, sunk
 from tests.simgap.test_gap_effects import performance, world_of
 
@@ -121,3 +122,11 @@ def test_a_support_settles_like_a_spring_beside_a_damper():
     oracle = lsim(([give], [time, 1.0]), borne[after], t[after] - t[after][0])[1]
     np.testing.assert_allclose(depth[after], oracle, atol=1e-9)
     np.testing.assert_allclose(depth[t < 1.0], give * 0.5, atol=1e-9)
+
+
+def test_a_parameter_whose_inverse_was_fitted_has_the_spread_of_its_interval():
+    """The inverse of a normal compliance that reaches zero has no standard deviation of its own."""
+    draws = 1 / np.random.default_rng(0).normal(5e-5, 1.5e-5, 2000)
+    found = _summary(draws, "N/m")
+    low, high = found["interval_90"]
+    assert 0.1 < found["sd"] / (high - low) < 0.5

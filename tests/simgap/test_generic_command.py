@@ -46,6 +46,22 @@ def test_values_of_against_reach_up_to_the_next_option(folder, monkeypatch):
     assert once == taken and len(once["sim"]) == len(once["real"]) == 5
 
 
+def test_columns_of_a_plain_task_are_those_that_the_rig_maps(folder, tmp_path):
+    for path in [*folder.glob("real_*.csv"), *folder.glob("sim_*.csv")]:
+        pd.read_csv(path).rename(columns={"t": "stamp"}).to_csv(path, index=False)
+    (folder / "columns.toml").write_text('[columns]\nt = {from = "stamp"}\n')
+    out = tmp_path / "out.json"
+    args = arguments(folder, "--rig", str(folder / "columns.toml"), "--json", str(out), "--quiet")
+    assert main(args) == 0 and json.loads(out.read_text())["causes"] == ["force_bias"]
+
+
+def test_a_gap_between_boundaries_that_could_be_elsewhere_comes_with_a_warning(folder, tmp_path):
+    (folder / "task.toml").write_text('sequence = ["approach", "press"]\n')  # one of two changes
+    out = tmp_path / "out.json"
+    assert main(arguments(folder, "--json", str(out), "--quiet")) == 0
+    assert any("as well be elsewhere" in line for line in json.loads(out.read_text())["warnings"])
+
+
 def test_a_plain_task_without_simulated_trials_is_refused(folder, capsys):
     args = arguments(folder)
     assert main(args[: args.index("--against")]) == 2
