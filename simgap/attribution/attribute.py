@@ -72,10 +72,9 @@ class EffectPosterior:
 
 @dataclass(frozen=True)
 class Remainder:
-    """What no named cause explains: its share of the gap (None: in all there is none), its p-value as noise,
-    and its cells."""
+    """What no named cause explains: its share of the gap, its p-value as noise, and its cells."""
 
-    share: float | None
+    share: float
     p_value: float
     where: tuple[Cell, ...]
 
@@ -250,10 +249,10 @@ def attribute(
     unexplained = significant(gap.rows, f.spectrum.band, left, sd)
     p_rest = detected(statistic(f, models, causes)).p_value
     explained = shares(f, model, by_group, rng)
-    # If noise differs between parts a gap may show in one place but not in the total, which causes then have
-    # no share of.
+    # If noise differs between parts a gap may show in one place but not in the total, of which no share is
+    # then known: all of it remains, or nothing.
     shown = explained.before > explained.floor or verdict.verdict == "none"
-    remains = explained.remainder if shown else None if causes else 1.0
+    remains = explained.remainder if shown else float(p_rest < ALARM)
     shrinkage = None if others is None else others.how_far(causes)
     chance = acting(sets, detection.p_value)
     somewhere = verdict.verdict != "none" or small is not None

@@ -336,7 +336,7 @@ Entries = list[dict[str, Any]]
 def entries(
     verdict: Verdict,
     detection: Detection,
-    remainder: tuple[float | None, float | None, Entries],
+    remainder: tuple[float, float | None, Entries],
     attribution: Mapping[str, tuple[float, float, tuple[float, float]]],
     where: Entries,
 ) -> dict[str, Any]:

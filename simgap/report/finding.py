@@ -247,7 +247,7 @@ def explained(body: Body) -> str:
     """Share of the gap that the causes explain, if the body has it."""
     parts = [(n, body.get("attribution", {}).get(n)) for n in body["causes"]]
     known = [(n, a) for n, a in parts if a and a.get("share") is not None]
-    if not known or (body.get("remainder") or {"share": 1.0})["share"] is None:
+    if not known:
         return ""
     if len(known) == 1:
         own = known[0][1]
@@ -272,10 +272,8 @@ def shrunk(body: Body) -> str:
 def remains(body: Body) -> list[str]:
     """What no cause explains, in words."""
     rest = body.get("remainder")
-    if not rest or body["verdict"] == "none" or "changes" in body:
+    if not rest or rest.get("share") is None or body["verdict"] == "none" or "changes" in body:
         return []
-    if rest["share"] is None:
-        return ["In all, the gap is no larger than the noise; it shows in single places only."]
     noise = rest.get("rms_over_noise")
     size = f" The whole residual is {plain(noise)} times the noise." if noise else ""
     if body["verdict"] == "unknown":

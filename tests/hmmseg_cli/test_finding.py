@@ -109,14 +109,6 @@ def test_no_more_is_said_of_noise_and_one_probability_of_a_cause():
     assert "--actual" in settles(found, weighed=False) and settles(found, weighed=True) == ""
 
 
-def test_no_cause_has_a_share_of_a_gap_that_is_no_larger_than_the_noise():
-    own = {"force_gain": {"probability": 0.8, "share": 0.94, "interval_90": [0.0, 1.0]}}
-    left = {"share": None, "p_value": 1.0, "where": []}
-    found = body("named", ["force_gain"], remainder=left, attribution=own)
-    said = " ".join([*sentences(found), *remains(found)])
-    assert "no larger than the noise" in said and "explains" not in said and "100 %" not in said
-
-
 def test_each_of_two_causes_is_told_by_its_own_parameters():
     means = {"force_bias.fx1": 0.0, "force_bias.fy1": 0.08, "table_compliance.stiffness": 32000.0}
     said = plain_name("force_bias+table_compliance", means)
