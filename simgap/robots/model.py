@@ -16,6 +16,7 @@ from simgap.simulators.user import restarts
 
 # numerics: windows of a regime; of more a search uses every second, third, ..
 FIRST = 48
+MOST_ROWS = 15000  # numerics: rows of a regime that a search uses at most
 SETTLE = 0.2  # numerics: s for a model to come to rest before a window of rest
 
 Point = Mapping[str, Mapping[str, float]]  # effect -> parameter -> value; neutral where absent
@@ -86,13 +87,16 @@ class Composed:
         return [made.count(self.motion[w.log]) for w in self.windows]
 
     def thinned(self) -> list[int]:
-        """Numbers of the windows that a search uses: evenly chosen ones of every regime, FIRST or more."""
+        """Numbers of the windows that a search uses: evenly chosen ones of every regime, FIRST or more where
+        that is no more than MOST_ROWS rows."""
         if any(w.start is None for w in self.windows):
             return [*range(len(self.windows))]
         kept: list[int] = []
         for regime in sorted({w.regime for w in self.windows}):
             mine = [k for k, w in enumerate(self.windows) if w.regime == regime]
-            kept += mine[:: max(1, len(mine) // FIRST)]
+            every = max(1, len(mine) // FIRST)
+            rows = sum(self.rows.of[k].stop - self.rows.of[k].start for k in mine) / every
+            kept += mine[:: every * int(np.ceil(rows / MOST_ROWS))]
         return sorted(kept)
 
     def commanded(self, point: Point) -> list[Recording]:

@@ -90,6 +90,18 @@ class FittedSet:
         """Rows (N,) of windows that neither diverged nor are off for reasons of their own."""
         return np.isfinite(self.linear.residual) & ~np.isin(self.linear.rows.window, list(self.wide))
 
+    def less(self, out: str) -> Names:
+        """The set without one effect."""
+        return tuple(n for n in self.names if n != out)
+
+    def promises(self, names: Names) -> float:
+        """The score that the closed form expects of a smaller set next to this one; none where an effect
+        diverges."""
+        if not {*self.names} <= {*self.sets.names}:
+            return -np.inf
+        whole, part = (float(self.sets.scores([one], 0)[0]) for one in (self.names, names))
+        return self.score + part - whole
+
     @cached_property
     def noise(self) -> float:
         """The expected mean square of a row under noise alone."""
@@ -161,10 +173,17 @@ class Search:
     def _with_less(self, found: FittedSet) -> FittedSet:
         """A set, after all sets with one effect less are fitted, too: they judge what each effect takes."""
         for out in found.names if len(found.names) > 1 else ():
-            rest = tuple(n for n in found.names if n != out)
-            if frozenset(rest) not in self.fitted:
-                self.fit(rest, without(found.point, out), [found.whiten])
+            self._without(found, out)
         return found
+
+    def _without(self, found: FittedSet, out: str) -> FittedSet:
+        """A set less one effect, fitted from the set's own point unless that promises no more than is known:
+        the solver's numbers have optima of their own, and sets are compared at the same."""
+        rest = found.less(out)
+        known = self.fitted.get(frozenset(rest))
+        if known is not None and found.promises(rest) <= known.score + BETTER:
+            return known
+        return self.fit(rest, without(found.point, out), [found.whiten])
 
     def nothing(self) -> FittedSet:
         """The empty set: only what is fitted along."""
@@ -454,10 +473,9 @@ class Search:
         return one.score > best.score + BETTER and predicts_better(gains)
 
     def _exchange(self, best: FittedSet) -> FittedSet | None:
-        """A better set without one of the best's causes, or with replacements for one."""
-        for out in best.names:
-            rest = tuple(n for n in best.names if n != out)
-            less = self.fitted.get(frozenset(rest)) or self.fit(rest, without(best.point, out), [best.whiten])
+        """A better set without one of the best's causes, least needed first, or with replacements for one."""
+        for out in sorted(best.names, key=lambda out: -best.promises(best.less(out))):
+            less = self._without(best, out)
             if less.linear.diverged:  # nothing can be proposed about it
                 continue
             there = less if self._is_better(less, best) else self._find_better(less, best)

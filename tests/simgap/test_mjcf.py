@@ -475,6 +475,16 @@ def test_a_payload_is_a_point_mass_where_it_is_said_to_be(files, place, at):
     assert np.abs(run() - other()).max() > 1e-3
 
 
+def test_a_load_is_carried_by_the_tool_that_is_fixed_to_the_last_link(files):
+    """A sensor in the wrist feels it there, and not on the link."""
+    tool = '<body name="hand" pos="0.3 0 0"><geom size="0.01" mass="0.2" contype="0" conaffinity="0"/></body>'
+    offered = turning(files, TURN, tool)[0].simulator.parameters
+    assert {"body:arm.mass", "body:hand.mass", "body:hand.com_x", "body:hand.payload"} <= {*offered}
+    assert "body:arm.payload" not in offered
+    stated = turning(files, 'payload_at = {arm = "tool"}\n' + TURN, tool)[0].simulator.parameters
+    assert "body:arm.payload" in stated and "body:hand.payload" not in stated
+
+
 def test_a_payload_where_nothing_is_is_said(files):
     with pytest.raises(InputError, match=r"payload_at.arm: the model has no site tol.*tool"):
         load_mjcf(*files(SERVO % "", 'payload_at = {arm = "tol"}\n' + TURN))

@@ -78,6 +78,30 @@ def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(d
     assert search._exchange(best) is None
 
 
+def test_a_set_is_fitted_again_from_a_larger_one_that_promises_more(damped, monkeypatch):
+    search = Search(damped, tuple(damped.effects), damped.rows.log)
+    one = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [search.nothing().whiten])
+    other = next(n for n, e in damped.effects.items() if not e.fitted and n != "viscous")
+    both = search.fit(("viscous", other), {**one.point, other: damped.effects[other].neutral()}, [one.whiten])
+    search.fitted[frozenset(one.names)] = replace(one, score=one.score - 50.0)  # stuck elsewhere
+    assert search._without(both, other).score == pytest.approx(one.score, abs=2 * BETTER)
+    monkeypatch.setattr(search, "fit", lambda *_: pytest.fail("fitted though nothing is promised"))
+    assert search._without(both, other).names == ("viscous",)
+
+
+def test_what_lines_from_starts_are_wrong_by_does_not_hide_in_a_sets_own_discrepancy(damped):
+    search = Search(damped, tuple(damped.effects), damped.rows.log)
+    nothing = search.nothing()
+    loud, quiet = (replace(nothing, discrepancy=d) for d in ({"angle": 1e3}, {}))
+    assert search._begun_anew(loud, quiet)[2] > 2 * search._begun_anew(loud, loud)[2] > 0
+
+
+def test_a_search_takes_fewer_windows_where_each_has_many_rows(damped, monkeypatch):
+    every = damped.thinned()
+    monkeypatch.setattr("simgap.robots.model.MOST_ROWS", damped.rows.log.size // 2)
+    assert damped.thinned() == every[::2] or len(damped.thinned()) < len(every)
+
+
 def test_what_is_settled_stays(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing = search.nothing()

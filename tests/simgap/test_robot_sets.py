@@ -102,6 +102,10 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
     rows[160:240] *= 3.0
     wide = cov.outliers(cov.whitener(cov.estimate(rows)), rows)
     assert {*wide} == {2} and wide[2] == pytest.approx(9.0, rel=0.4)
+    for known in (found, {"p": 7.0, "q": 0.1}):  # wherever the search begins
+        again = cov.estimate(rows, wide, known)
+        assert again == pytest.approx(cov.estimate(rows, wide), rel=0.01)
+    assert cov.estimate(rows, wide, {}) == {}
 
 
 def test_what_shows_in_every_window_is_no_windows_own():

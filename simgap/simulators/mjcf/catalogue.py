@@ -159,24 +159,42 @@ class _Catalogue:
                 self.add(f"{head}.limit", sd, f"saturation of {name}", low=1e-9)
 
     def add_bodies(self, joints: Sequence[int]) -> None:
-        """Mass, centre of mass, payload and link length of bodies with joints of their own."""
+        """Mass, centre of mass, payload and link length of bodies with joints, and of tools fixed to them."""
         m = self.model
         for b in sorted({int(m.jnt_bodyid[j]) for j in (*joints, *self.simulator.free)}):
-            name, mass = name_of(m, "body", b), float(m.body_mass[b])
-            if not name or mass <= 0:
+            name = name_of(m, "body", b)
+            if not name or m.body_mass[b] <= 0:
                 continue
-            self.add(f"body:{name}.mass", SIZE * mass, f"mass (and inertia) of {name}", low=1e-3 * mass)
-            gyration, centre = float(np.sqrt(m.body_inertia[b].sum() / mass)), f"body:{name}.com"
-            for axis in "xyz":
-                self.add(f"{centre}_{axis}", SIZE * gyration, f"centre of mass of {name}", effect=centre)
+            self._add_mass(b)
             if not any(m.body_jntnum[c] for c in range(1, m.nbody) if m.body_parentid[c] == b):
-                self._add_payload(name)
+                tool = self._tool(b)
+                if tool != b:
+                    self._add_mass(tool)
+                self._add_payload(name if name in self.simulator.map.payload_at else name_of(m, "body", tool))
             first = int(m.body_jntadr[b])
             chained = (
                 m.body_jntnum[b] and int(m.jnt_type[first]) in (HINGE, SLIDE) and m.body_parentid[b] != 0
             )
             if chained and np.linalg.norm(m.body_pos[b]) > 1e-6:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
+
+    def _add_mass(self, body: int) -> None:
+        m, name = self.model, name_of(self.model, "body", body)
+        mass, centre = float(m.body_mass[body]), f"body:{name}.com"
+        self.add(f"body:{name}.mass", SIZE * mass, f"mass (and inertia) of {name}", low=1e-3 * mass)
+        gyration = float(np.sqrt(m.body_inertia[body].sum() / mass))
+        for axis in "xyz":
+            self.add(f"{centre}_{axis}", SIZE * gyration, f"centre of mass of {name}", effect=centre)
+
+    def _tool(self, body: int) -> int:
+        """Of a body and those fixed to it the farthest, which a sensor in the wrist feels."""
+        m, data = self.model, mujoco.MjData(self.model)
+        mujoco.mj_kinematics(m, data)
+        fixed = np.flatnonzero((np.asarray(m.body_weldid) == body) & (np.asarray(m.body_mass) > 0))
+        away = {
+            int(b): np.linalg.norm(data.xpos[b] - data.xpos[body]) for b in fixed if name_of(m, "body", b)
+        }
+        return max(away, key=lambda b: away[b])
 
     def _add_payload(self, body: str) -> None:
         """A load where the map says, or where one is likely."""
