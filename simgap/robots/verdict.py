@@ -53,7 +53,8 @@ class Shrinkage:
     `before`, `after`, `noise_floor`: mean squares of whitened residuals, and those of noise alone;
     `fraction`, `interval_90`: the share of the gap that is gone, and its 90 % interval by fold; `rms`: root
     mean squares before and after by channel, in its unit; `plain`, `residual`: residuals (N,) before and
-    after; NaN where unknown; `squares`: their whitened squares (2, N); NaN where one is unknown.
+    after, along windows run from the starts that the logs show; NaN where unknown; `squares`: their whitened
+    squares (2, N); NaN where one is unknown.
     """
 
     before: float
@@ -93,11 +94,12 @@ def shrinkage(best: FittedSet, nothing: FittedSet, composed: Composed, fold: np.
     gone, there = square[:, 0] - square[:, 1], square[:, 0] - square[:, 2]
     if there.sum() <= 0:
         return None
-    was, now = rows.rms(before, usable), rows.rms(after, usable)
+    plain, residual = (one.covariances.without_starts(one.whiten, r) for one, r in both)
+    was, now = rows.rms(plain, usable), rows.rms(residual, usable)
     rms = {name: (was[name], now[name]) for name in was}
     mean = square.sum(0) / usable.sum()
     fraction, interval = fraction_gone(gone, there)
-    return Shrinkage(float(mean[0]), float(mean[1]), float(mean[2]), fraction, interval, rms, before, after,
+    return Shrinkage(float(mean[0]), float(mean[1]), float(mean[2]), fraction, interval, rms, plain, residual,
                      np.where(usable, white, np.nan))  # fmt: skip
 
 

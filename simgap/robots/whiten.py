@@ -222,6 +222,13 @@ class Covariances:
             for b, inverse in zip(self.blocks, whiten.inverses, strict=True)
         }
 
+    def without_starts(self, whiten: Whitener, residual: np.ndarray) -> np.ndarray:
+        """A residual (N,) less what the uncertain starts of windows make of it."""
+        out, white = residual.copy(), whiten(np.nan_to_num(residual))
+        for b, inverse in zip(self.blocks, whiten.inverses, strict=True):
+            out[b.rows] -= b.start @ ((inverse @ b.start).T @ white[b.rows])
+        return out
+
     def outliers(self, whiten: Whitener, residual: np.ndarray) -> dict[int, float]:
         """Windows whose residual (N,) exceeds noise and discrepancy, with the factor of their variance.
 

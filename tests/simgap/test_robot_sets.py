@@ -162,3 +162,14 @@ def test_a_set_predicts_better_only_where_logs_agree():
     assert predicts_better(np.array([9.0, 370.0, 21.0]))  # much, and in one log far more
     assert not predicts_better(np.array([0.3, 37.0, -8.7]))  # one log is predicted worse
     assert not predicts_better(np.array([0.3, 370.0, 0.2]))  # one log alone says so
+
+
+def test_what_starts_make_of_a_residual_is_taken_from_it():
+    rng, cov = np.random.default_rng(3), Covariances(tuple(block(k) for k in range(4)))
+    noise = np.sqrt(0.5) * rng.standard_normal(320)
+    moved = np.concatenate([b.start @ rng.standard_normal(2) for b in cov.blocks])
+    left = cov.without_starts(cov.whitener(), noise + moved)
+    assert (
+        np.mean(left**2) == pytest.approx(np.mean(noise**2), rel=0.1) and np.mean((noise + moved) ** 2) > 1.5
+    )
+    assert np.isnan(cov.without_starts(cov.whitener(), np.where(moved > 9, moved, np.nan))).all()
