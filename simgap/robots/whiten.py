@@ -52,7 +52,7 @@ ALONE = -4.0  # prior: log odds that a window is off for reasons of its own
 BELOW = (0.0, 8.0)
 WORTH = 3.0  # chosen: nats that a source must gain to count at all
 NOTHING = 0.01  # numerics: nats to which log variances are found
-CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}
+CLOSE = {"maxiter": 40, "ftol": 1e-6, "gtol": 0.05}  # numerics: of their search
 
 
 Discrepancy = dict[str, float]  # s by source, of a channel [unit / s^2, unit / s or unit]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,13 +14,15 @@ from numpy.polynomial import Polynomial
 
 from hmmseg.robust import bridged
 from simgap.latest import latest
-from simgap.simulators.mjcf.engine import FULL, mujoco
+from simgap.simulators.mjcf.engine import FULL, HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
 from simgap.simulators.mjcf.setting import HOLD, LATE, SMOOTH, Setting, changed_model, nothing, object_id
 from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
 from simgap.simulators.recording import Recording
+
+CLOSING, CLOSED = 20, 1e-9  # numerics: most steps that close a loop, and the last of them
 
 
 @dataclass
@@ -61,6 +63,7 @@ class MjcfSimulator:
         places = (self.model.jnt_qposadr, self.model.jnt_dofadr)
         self._places = {c: tuple(int(p[j]) for p in places) for c, j in self.joints.items()}
         self._ties = [(*tie, tie[-1].deriv()) for tie in ties(self.model, [*self.joints.values()])]
+        self._inner = inner(self.model, {*self.joints.values(), *(tie[0] for tie in self._ties)})
         self._nominal = {n: s.nominal for n, s in self.settings.items()}
         # A law that acts needs all its numbers, those too that are as it came.
         of_laws = (n for n, s in self.settings.items() if s.put is nothing and s.nominal)
@@ -160,6 +163,25 @@ class MjcfSimulator:
             at, away = m.jnt_qposadr[joint], q[m.jnt_qposadr[other]] - m.qpos0[m.jnt_qposadr[other]]
             q[at] = m.qpos0[at] + by(away)
             v[m.jnt_dofadr[joint]] = slope(away) * v[m.jnt_dofadr[other]]
+        return self._closed(state) if self._inner.size else state
+
+    def _closed(self, state: np.ndarray) -> np.ndarray:
+        """A full physics state whose inner joints close the model's loops: Newton's method for their places,
+        and the rates at which the loops stay closed."""
+        m, data, dofs = self.model, self._data[0], self.model.jnt_dofadr[self._inner]
+        place, rate = 1 + m.jnt_qposadr[self._inner], 1 + m.nq + dofs
+        for _ in range(CLOSING):
+            mujoco.mj_setState(m, data, state, FULL)
+            mujoco.mj_fwdPosition(m, data)
+            loops = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+            slopes = np.stack([_carried(m, data, one)[loops] for one in np.eye(m.nv)[dofs]], 1)
+            step = np.linalg.lstsq(slopes, data.efc_pos[loops], rcond=None)[0]
+            state[place] -= step
+            if np.abs(step).max() < CLOSED:
+                break
+        state[rate] = 0.0
+        drawn = _carried(m, data, state[1 + m.nq : 1 + m.nq + m.nv])[loops]
+        state[rate] = -np.linalg.lstsq(slopes, drawn, rcond=None)[0]
         return state
 
     def _own_state(self, log: Recording) -> np.ndarray:
@@ -254,6 +276,23 @@ def tied(model: Any) -> np.ndarray:
     """The active equalities (k,) by which one joint follows another."""
     joints = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)
     return np.flatnonzero(joints & (model.eq_obj2id >= 0))
+
+
+def inner(model: Any, known: Set[int]) -> np.ndarray:
+    """Hinges and slides (k,) that neither a column nor another joint tells, where bodies that are connected
+    close loops."""
+    kinds = mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD
+    if not (np.isin(model.eq_type, kinds) & model.eq_active0.astype(bool)).any():
+        return np.zeros(0, int)
+    turns = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE)))
+    return np.array([j for j in turns if int(j) not in known], int)
+
+
+def _carried(model: Any, data: Any, rates: np.ndarray) -> np.ndarray:
+    """Rates (n,) of all constraints at rates (nv,) of the joints."""
+    out = np.zeros(data.nefc)
+    mujoco.mj_mulJacVec(model, data, out, np.ascontiguousarray(rates))
+    return out
 
 
 def ties(model: Any, seen: Sequence[int]) -> list[tuple[int, int, Polynomial]]:
