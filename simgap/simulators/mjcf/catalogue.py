@@ -191,10 +191,8 @@ class _Catalogue:
         m, data = self.model, mujoco.MjData(self.model)
         mujoco.mj_kinematics(m, data)
         fixed = np.flatnonzero((np.asarray(m.body_weldid) == body) & (np.asarray(m.body_mass) > 0))
-        away = {
-            int(b): np.linalg.norm(data.xpos[b] - data.xpos[body]) for b in fixed if name_of(m, "body", b)
-        }
-        return max(away, key=lambda b: away[b])
+        named = [b for b in fixed.tolist() if name_of(m, "body", b)]
+        return max(named, key=lambda b: float(np.linalg.norm(data.xpos[b] - data.xpos[body])))
 
     def _add_payload(self, body: str) -> None:
         """A load where the map says, or where one is likely."""
