@@ -255,7 +255,7 @@ def explained(body: Body) -> str:
         sure = f" (90 % interval {ends})" if ends else ""
         return f"It explains {percent(own['share'])} of the gap{sure}."
     shares = ", ".join(f"{percent(a['share'])} by {plain_name(n)}" for n, a in known)
-    return f"The gap is explained {shares}."
+    return f"Of the gap, {shares.replace(' by ', ' is explained by ', 1)}."
 
 
 def shrunk(body: Body) -> str:

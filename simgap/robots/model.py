@@ -96,7 +96,7 @@ class Composed:
             mine = [k for k, w in enumerate(self.windows) if w.regime == regime]
             every = max(1, len(mine) // FIRST)
             rows = sum(self.rows.of[k].stop - self.rows.of[k].start for k in mine) / every
-            kept += mine[:: every * int(np.ceil(rows / MOST_ROWS))]
+            kept += mine[:: every * max(1, int(np.ceil(rows / MOST_ROWS)))]
         return sorted(kept)
 
     def commanded(self, point: Point) -> list[Recording]:

@@ -179,6 +179,7 @@ class _Catalogue:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
 
     def _add_mass(self, body: int) -> None:
+        """A body's mass and centre of mass."""
         m, name = self.model, name_of(self.model, "body", body)
         mass, centre = float(m.body_mass[body]), f"body:{name}.com"
         self.add(f"body:{name}.mass", SIZE * mass, f"mass (and inertia) of {name}", low=1e-3 * mass)

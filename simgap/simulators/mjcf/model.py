@@ -23,6 +23,7 @@ from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, 
 from simgap.simulators.recording import Recording
 
 CLOSING, CLOSED = 20, 1e-9  # numerics: most steps that close a loop, and the last of them
+GIVEN = 1000  # numerics: windows for which it is kept how far ties give in the model's own run
 
 
 @dataclass
@@ -55,6 +56,7 @@ class MjcfSimulator:
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
     _logs: dict[str, Recording] = field(default_factory=dict, repr=False)
     _ran: dict = field(default_factory=dict, repr=False)
+    _gave: dict = field(default_factory=dict, repr=False)
     _touched: dict = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
@@ -141,7 +143,7 @@ class MjcfSimulator:
             state[1 + nq + v] = job.start[column + RATE]
         state = self._tied(state)
         if there is not None:  # under load a tie gives, as in the model's own run
-            state += there - self._tied(there)
+            state += latest(self._gave, there.tobytes(), lambda: there - self._tied(there), GIVEN)
         for joint, columns in self.free.items():
             q, v = 1 + int(self.model.jnt_qposadr[joint]), 1 + nq + int(self.model.jnt_dofadr[joint])
             place, turn = [columns[a] for a in POSE[:3]], [columns[a] for a in POSE[3:]]
