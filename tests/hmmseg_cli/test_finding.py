@@ -115,7 +115,8 @@ def test_each_of_two_causes_is_told_by_its_own_parameters():
     assert said == "a zero error of force sensor fy1 and a table that yields under load"
     own = {n: {"probability": 0.8, "share": s} for n, s in (("force_bias", 0.7), ("table_tilt", 0.3))}
     found = body("named", ["force_bias", "table_tilt"], attribution=own)
-    assert "70 % is explained by zero errors of the force sensors, 30 % by a table" in " ".join(sentences(found))
+    told = " ".join(sentences(found))
+    assert "70 % is explained by zero errors of the force sensors, 30 % by a table" in told
 
 
 def test_a_part_of_a_robot_is_told_in_words_with_the_models_own_value():
