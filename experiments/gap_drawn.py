@@ -15,8 +15,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from experiments.blind_check.diagnose import diagnose_folder
 from experiments.blind_check.judge import intervals_hold
+from experiments.robots_check.score import FLOOR
 from experiments.saving import save
 from experiments.table_text import markdown
 from simgap.attribution.verdict import RECORD
@@ -56,8 +59,7 @@ def outcome(label: dict[str, Any], found: dict[str, Any]) -> str:
 
 
 def row(label: dict[str, Any], found: dict[str, Any]) -> dict[str, Any]:
-    """Summary of a case's diagnosis; `gain` [nats] is that of the true effect alone, None if it is a
-    scatter."""
+    """Summary of a case's diagnosis; `gain` [nats] is that of the true effect alone."""
     gains = found.get("gains", {})
     return {
         "case": label["case"], "tier": label["tier"], "effects": label["effects"],
@@ -118,10 +120,10 @@ def table(found: dict[str, Any]) -> str:
     """docs/gap_results.md: open labs, one column a version of the code, or a set of labs."""
     runs: dict[str, list[dict[str, Any]]] = found["runs"]
 
-    def line(name: str, tiers: Sequence[str], *which: str) -> list[str]:
+    def line(name: str, tiers: Sequence[str], *which: str, least: float = -np.inf) -> list[str]:
         cells = []
         for rows in runs.values():
-            of = [r for r in rows if r["tier"] in tiers]
+            of = [r for r in rows if r["tier"] in tiers and (r["gain"] is None or r["gain"] >= least)]
             cells.append(f"{sum(r['outcome'] in which for r in of)} of {len(of)}" if of else "")
         return [name, *cells]
 
@@ -146,6 +148,8 @@ def table(found: dict[str, Any]) -> str:
         line("single: unknown", ["single"], "unknown"),
         line("single: not noticed, or too small to matter", ["single"], "missed", "too small"),
         line("single: another name", ["single"], "wrong name"),
+        line(f"single that gains {FLOOR:.0f} nats: named alone", ["single"], "named", least=FLOOR),
+        line("the same: named alone or in a set", ["single"], "named", "set", least=FLOOR),
         line("pairs: whole", ["pair"], "named"),
         line("pairs: one of both", ["pair"], "half"),
         line("outside: unknown", ["outside"], "unknown"),

@@ -22,6 +22,7 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg.segmentation.align import AlignedTrials, align
+from simgap.attribution.posterior import fitted, forms
 from simgap.effects import name_of
 from simgap.gap.diagnose import Diagnosis, diagnose
 
@@ -86,11 +87,12 @@ def excluded(folder: Path) -> tuple[str, ...]:
 
 
 def _gains(found: Diagnosis) -> dict[str, float]:
-    """Gain of each single effect over none [nats], minus a nat per parameter (Akaike).
-
-    Effects that only scatter have none: the scorer goes by what they move.
-    """
-    healthy, out = found.search.healthy, {}
+    """Gain of each single effect over none [nats], minus a nat per parameter (Akaike); of effects that shift
+    no signals, their log Bayes factor."""
+    healthy, f, out = found.search.healthy, forms(found.search.gap), {}
+    for j in range(len(found.search.fits), len(f.gap.candidates)):
+        name, score = f.gap.candidates[j].name, fitted(f, (j,)).score - f.log_odds
+        out[name] = max(out.get(name, -np.inf), float(score - fitted(f, ()).score))
     for f in found.search.fits:
         name, more = name_of(f.effects[0]), len(f.columns) - len(healthy.columns)
         out[name] = max(out.get(name, -np.inf), float(healthy.cost - f.cost - more))

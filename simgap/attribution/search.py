@@ -90,12 +90,13 @@ def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
 
 
 def _linearised(f: Forms, effects: Sequence[int]) -> tuple[int, ...]:
-    """The same forms of effects, each as linearised beside those that are most like the rest of the set."""
+    """The same forms of effects, each as linearised beside those that are most like the rest of the set, last
+    of all."""
     of, out = f.gap.candidates, []
     for j in effects:
         rest = {of[i].name for i in effects} - {of[j].name}
         same = [j, *(i for i, c in enumerate(of) if c.form_of == of[j].form_of)]
-        out.append(min(same, key=lambda i: len({*of[i].beside} ^ rest)))
+        out.append(min(same, key=lambda i: (len({*of[i].beside} ^ rest), -i)))
     return tuple(sorted(out))
 
 
