@@ -329,7 +329,7 @@ def _clipped(simulator: MjcfSimulator, log: Recording, file: str) -> list[str]:
 
 def continuous(log: Recording, turn: Sequence[str]) -> Recording:
     """Quaternion columns whose signs do not jump: q and -q are the same rotation."""
-    quat = np.array([log[n] for n in turn])
+    quat = np.array([held(log[n]) for n in turn])
     dot = np.nansum(quat[:, 1:] * quat[:, :-1], 0)
     sign = np.cumprod(np.concatenate([[1.0], np.where(dot < 0, -1.0, 1.0)]))
     return log.with_columns({n: sign * log[n] for n in turn})
