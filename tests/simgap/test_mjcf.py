@@ -476,8 +476,8 @@ FOUR_BARS = """<mujoco><worldbody>
 ])  # fmt: skip
 def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, value, stated):
     finger = (
-        '<body name="{0}" pos="0 {1} 0"><joint name="{0}" type="slide" axis="0 1 0" damping="6" armature="{2}"'
-        ' frictionloss="0.6"/><geom type="box" size="0.01 0.005 0.03" mass="{3}"/></body>'
+        '<body name="{0}" pos="0 {1} 0"><joint name="{0}" type="slide" axis="0 1 0" damping="6"'
+        ' armature="{2}" frictionloss="0.6"/><geom type="box" size="0.01 0.005 0.03" mass="{3}"/></body>'
     )
     xml = (
         '<mujoco><option timestep="0.001"/><worldbody>'
