@@ -162,7 +162,7 @@ class Composed:
         new = [w for w, key in zip(self.windows, keys, strict=True) if key not in self._slopes]
         if new:
             known = self.effects[name].parameters[short]
-            about = self._without_dear(self.about)
+            about = {**self._without_dear(self.about), **self._before(name)}
             now = {**self.effects[name].neutral(), **about.get(name, {})}
             step = known.sd if now[short] + known.sd <= known.high else -known.sd
             there = {**about, name: {**now, short: now[short] + step}}
@@ -172,6 +172,19 @@ class Composed:
                 found = {n: v / step for n, v in (change or {}).items()}
                 self._slopes[w.log, w.begin, w.end, name, short] = found
         return [self._slopes[key] for key in keys]
+
+    def _before(self, name: str) -> Point:
+        """The simulator's own numbers before one, at the far end of their second run where they are nearer to
+        that: the errors of a step and of an integrator do not add up in contact."""
+        ends, out = getattr(self.simulator, "dear", {}), dict[str, Mapping[str, float]]()
+        for other, theta in self.about.items():
+            if other == name:
+                break
+            for short, value in theta.items():
+                end = ends.get(self.effects[other].model.get(short, ""))
+                if end and value / end > 0.5:
+                    out[other] = {short: end}
+        return out
 
     def _rolled(
         self, point: Point, windows: Sequence[Window], starts: Sequence[Mapping[str, float] | None]

@@ -257,6 +257,22 @@ TIE = """<body name="head" pos="1 0 0"><joint name="nod" axis="0 0 1"/><geom siz
   </worldbody><equality><joint joint1="nod" joint2="turn"/></equality>"""
 
 
+def test_a_fourth_of_the_step_by_another_integrator_is_the_run_itself(files):
+    xml = SERVO.replace("0.001", "0.008") % ""
+    found, t = load_mjcf(*files(xml, TURN)), np.arange(0, 1, 0.008)
+    goal = np.where(t > 0.3, 1.0, 0.0)
+    log = Recording("a.csv", t, {"q": 0.3 * np.cos(3.0 * t), "u": goal})
+    effects = effects_of(found.simulator, [log], found.effects([log]))
+    point = {"option.timestep": {"timestep": -0.75}, "option.integrator": {"integrator": 1.0}}
+    composed = Composed.of(found.simulator, [log], effects, {"q": 1e-4}).moved(point)
+    starts = composed.starts(point)
+    finer = load_mjcf(*files(xml.replace("0.008", "0.002").replace("implicitfast", "Euler"), TURN))
+    finer.effects([log])
+    for window, start, ours in zip(composed.windows, starts, composed.rolled(point, starts), strict=True):
+        own = finer.simulator.simulate({}, log.window(window.begin, window.end), start)
+        np.testing.assert_allclose(ours["q"], own["q"], atol=1e-9)
+
+
 @pytest.mark.parametrize("name", SET)
 def test_a_patched_model_is_the_one_that_was_simulated(files, name):
     paths = files(SERVO.replace('gravity="0 0 0"', "").replace("</worldbody>", TIE) % "", TURN)

@@ -87,8 +87,8 @@ class MjcfSimulator:
             changed = tuple((n, v) for n, v in values if v != own[n] or self._shapes.get(n, "") in acting)
             groups[changed].append(i)
         for key, mine in groups.items():
-            mixed = [(n, v) for n, v in key if self.settings[n].mixed is not None]
-            changed = tuple((n, v) for n, v in key if self.settings[n].mixed is None)
+            mixed = [(n, v) for n, v in key if self.settings[n].mixed not in (None, v)]
+            changed = tuple(c for c in key if c not in mixed)
             for i, channels in zip(mine, self._all([jobs[i] for i in mine], changed), strict=True):
                 out[i] = channels
             for name, value in mixed:
@@ -208,12 +208,12 @@ class MjcfSimulator:
     @property
     def numerics(self) -> frozenset[str]:
         """Parameters of the simulation rather than the robot."""
-        return self.dear | ({HOLD, LATE, SMOOTH} & self.settings.keys())
+        return frozenset(self.dear) | ({HOLD, LATE, SMOOTH} & self.settings.keys())
 
     @property
-    def dear(self) -> frozenset[str]:
-        """Those of them that cost a second run."""
-        return frozenset(n for n, s in self.settings.items() if s.mixed is not None)
+    def dear(self) -> dict[str, float]:
+        """Those of them that cost a second run, and their value in it."""
+        return {n: s.mixed for n, s in self.settings.items() if s.mixed is not None}
 
     @property
     def states(self) -> tuple[str, ...]:
