@@ -444,10 +444,11 @@ class Search:
         return None if found is best else found
 
     def predicts_better(self, one: FittedSet, other: FittedSet, by: FittedSet) -> bool:
-        """Whether a set predicts held-out folds better than another, with the discrepancy of one of them.
+        """Whether a set predicts held-out folds better than another.
 
-        Its size differs between motions, so that a set which leaves a smaller one in some of them predicts
-        the others no worse for it. How errors of starts grow is each set's own.
+        Both have the discrepancy of `by`, one of them: its size differs between motions, so that a set which
+        leaves a smaller one in some of them predicts the others no worse for it. How errors of starts grow is
+        each set's own.
         """
         gain = self._held_out(one, by) - self._held_out(other, by)
         return predicts_better(gain, _overstated(by, other if one is by else one))
@@ -471,9 +472,26 @@ class Search:
             return not self.predicts_better(best, one, one)
         return one.score > best.score + BETTER and self.predicts_better(one, best, one)
 
+    def _judge_twins(self, best: FittedSet, out: str) -> None:
+        """Judge in a cause's place what does the same by the same share, as a command's gain does what its
+        motor's does: where the gap is large, straight lines do not lead from nothing to both."""
+        every = {n: [*self.composed.effects[n].parameters.items()] for n in (out, *self.wanted)}
+        of_shares = [n for n, known in every.items() if [p.unit for _, p in known] == ["1"]]
+        for name in of_shares if out in of_shares else ():
+            ((short, p),), ((own, q),) = every[name], every[out]
+            at = {short: p.nominal + best.point[out][own] - q.nominal}
+            point = {**without(best.point, out), name: at}
+            apart = best.linear.target - best.linear.residual - base_at(best.composed, point).rows
+            same = np.sum(best.covariances.whitener()(apart) ** 2) < SETTLED
+            if same and name not in best.names:
+                one = self._judge(best.composed, (*best.less(out), name), point)
+                known = self.fitted.get(frozenset(one.names), one)
+                self.fitted[frozenset(one.names)] = max(one, known, key=lambda fitted: fitted.score)
+
     def _exchange(self, best: FittedSet) -> FittedSet | None:
         """A better set without one of the best's causes, least needed first, or with replacements for one."""
         for out in sorted(best.names, key=lambda out: -best.promises(best.less(out))):
+            self._judge_twins(best, out)
             less = self._without(best, out)
             if less.linear.diverged:  # nothing can be proposed about it
                 continue
