@@ -144,7 +144,7 @@ class Composed:
                     out = self.stepped(out, name, short, value - neutral[short])
         return out
 
-    def _without_dear(self, point: Point) -> Point:
+    def _without_dear(self, point: Point) -> dict[str, Mapping[str, float]]:
         return {n: v for n, v in point.items() if not self.effects[n].dear}
 
     def stepped(
@@ -159,36 +159,23 @@ class Composed:
         """Derivatives of every window's true channels by one of the simulator's own numbers; empty where it
         diverged."""
         keys = [(w.log, w.begin, w.end, name, short) for w in self.windows]
-        if new := [k for k, key in enumerate(keys) if key not in self._slopes]:
-            about, (share, finer) = self._without_dear(self.about), self._finer(name)
-            for k, slope in zip(new, self._changes(new, about, name, short), strict=True):
-                self._slopes[keys[k]] = slope
-            touch = [k for k in new if share and self.windows[k].regime != FLIES]
-            for k, there in zip(touch, self._changes(touch, {**about, **finer}, name, short), strict=True):
-                mine = self._slopes[keys[k]].items()
-                self._slopes[keys[k]] = {n: v + share * (there.get(n, v) - v) for n, v in mine}
+        new = [w for w, key in zip(self.windows, keys, strict=True) if key not in self._slopes]
+        if new:
+            known = self.effects[name].parameters[short]
+            about = self._without_dear(self.about)
+            first = [n for n in self.about if self.effects[n].dear][:1]  # the solver's step
+            if name not in first and any(w.regime != FLIES for w in self.windows):
+                # In contact what an integrator changes at one step is not what it changes at another.
+                about |= {n: self.about[n] for n in first}
+            now = {**self.effects[name].neutral(), **about.get(name, {})}
+            step = known.sd if now[short] + known.sd <= known.high else -known.sd
+            there = {**about, name: {**now, short: now[short] + step}}
+            both = [self._rolled(p, new, [w.begun() for w in new]) for p in (about, there)]
+            for w, here, moved in zip(new, *both, strict=True):
+                change = {} if here is None or moved is None else _sum(moved, here, -1.0)
+                found = {n: v / step for n, v in (change or {}).items()}
+                self._slopes[w.log, w.begin, w.end, name, short] = found
         return [self._slopes[key] for key in keys]
-
-    def _changes(self, numbers: Sequence[int], about: Point, name: str, short: str) -> list[Channels]:
-        """The same of some windows, by number, about a point."""
-        known, windows = self.effects[name].parameters[short], [self.windows[k] for k in numbers]
-        begun = [w.begun() for w in windows]
-        now = {**self.effects[name].neutral(), **about.get(name, {})}
-        step = known.sd if now[short] + known.sd <= known.high else -known.sd
-        there = {**about, name: {**now, short: now[short] + step}}
-        both = zip(*(self._rolled(p, windows, begun) for p in (about, there)), strict=True)
-        return [
-            {} if here is None or moved is None else {n: (v - here[n]) / step for n, v in moved.items()}
-            for here, moved in both
-        ]
-
-    def _finer(self, name: str) -> tuple[float, Point]:
-        """How far the first of the simulator's own numbers, its step, is on the way to its second run's, and
-        that: in contact what others change at the one step is not what they change at the other."""
-        for first, end in [*getattr(self.simulator, "dear", {}).items()][:1]:
-            for short, value in self.about.get(first, {}).items() if first != name else ():
-                return float(np.clip(value / end, 0.0, 1.0)), {first: {short: end}}
-        return 0.0, {}
 
     def _rolled(
         self, point: Point, windows: Sequence[Window], starts: Sequence[Mapping[str, float] | None]

@@ -509,9 +509,8 @@ def _prior_constants(sizes: Sequence[int]) -> float:
 def _overstated(by: FittedSet, rival: FittedSet) -> float:
     """By how much the discrepancy of a set overstates log odds over a rival; 1 if by nothing.
 
-    The score of a step from one to the other varies between windows by the information on it. Where it varies
-    more, the discrepancy has the wrong form, and log odds are that many times too large (Royall and Tsou,
-    JRSS B 65, 2003).
+    Where the score of a step from one to the other varies more between windows than its information says, log
+    odds are that many times too large (Royall and Tsou, JRSS B 65, 2003).
     """
     if not by.discrepancy:
         return 1.0
