@@ -17,7 +17,6 @@ from simgap.robot_effects.base import Setting  # noqa: E402
 from simgap.robots.model import Composed  # noqa: E402
 from simgap.robots.patch import patched  # noqa: E402
 from simgap.robots.rows import noises  # noqa: E402
-from simgap.robots.windows import STRIKES  # noqa: E402
 from simgap.simulators.mjcf.engine import rollout, warned  # noqa: E402
 from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
 from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
@@ -256,23 +255,6 @@ SET = ("joint:turn.damping", "joint:turn.armature", "body:arm.mass", "body:arm.c
        "joint:nod.tie")  # fmt: skip
 TIE = """<body name="head" pos="1 0 0"><joint name="nod" axis="0 0 1"/><geom size="0.02" mass="0.1"/></body>
   </worldbody><equality><joint joint1="nod" joint2="turn"/></equality>"""
-
-
-def test_in_contact_a_fourth_of_the_step_by_another_integrator_is_the_run_itself(files):
-    xml = SERVO.replace("0.001", "0.008") % ""
-    found, t = load_mjcf(*files(xml, TURN)), np.arange(0, 1, 0.008)
-    goal = np.where(t > 0.3, 1.0, 0.0)
-    log = Recording("a.csv", t, {"q": 0.3 * np.cos(3.0 * t), "u": goal})
-    effects = effects_of(found.simulator, [log], found.effects([log]))
-    point = {"option.timestep": {"timestep": -0.75}, "option.integrator": {"integrator": 1.0}}
-    composed = Composed.of(found.simulator, [log], effects, {"q": 1e-4}).moved(point)
-    composed = replace(composed, windows=tuple(replace(w, regime=STRIKES) for w in composed.windows))
-    starts = composed.starts(point)
-    finer = load_mjcf(*files(xml.replace("0.008", "0.002").replace("implicitfast", "Euler"), TURN))
-    finer.effects([log])
-    for window, start, ours in zip(composed.windows, starts, composed.rolled(point, starts), strict=True):
-        own = finer.simulator.simulate({}, log.window(window.begin, window.end), start)
-        np.testing.assert_allclose(ours["q"], own["q"], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", SET)
