@@ -67,7 +67,7 @@ def of_channel(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffec
     begun = {r.name: float(r.t[0]) for r in setting.recordings}
 
     def acting(act: Act, log: Recording, values: np.ndarray, theta: Theta) -> dict[str, np.ndarray]:
-        return {name: act(log.t - begun.get(log.name, log.t[0]), values, theta)}
+        return {name: _where_seen(act, log.t - begun.get(log.name, log.t[0]), values, theta)}
 
     def restore(log: Recording, theta: Theta) -> Recording:
         assert effect.undo is not None
@@ -78,6 +78,14 @@ def of_channel(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffec
         alter=lambda window, channels, theta: acting(effect.read, window, channels[name], theta),
         restore=None if effect.undo is None else restore,
     )  # fmt: skip
+
+
+def _where_seen(act: Act, t: np.ndarray, values: np.ndarray, theta: Theta) -> np.ndarray:
+    """What acts from sample to sample, from those to those that are there."""
+    out, seen = np.array(values), np.isfinite(values)
+    if seen.sum() > 1:
+        out[seen] = act(t[seen], values[seen], theta)
+    return out
 
 
 Turn = Callable[[np.ndarray, Channels, Theta, float], Channels]  # (times, columns, theta, 1 there or -1 back)
@@ -101,7 +109,7 @@ def of_pose(body: str, columns: Mapping[str, str]) -> Iterator[RobotEffect]:
     def late(t: np.ndarray, known: Channels, theta: Theta, way: float) -> Channels:
         read = LAG.read if way > 0 else LAG.undo
         assert read is not None
-        return {n: read(t, known[n], theta) for n in (*place, *turn)}
+        return {n: _where_seen(read, t, known[n], theta) for n in (*place, *turn)}
 
     def turned(t: np.ndarray, known: Channels, theta: Theta, way: float) -> Channels:
         half = 0.5 * way * np.array([theta[f"about_{a}"] for a in PLACE])

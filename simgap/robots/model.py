@@ -9,7 +9,7 @@ import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.rows import Rows, rows_of
-from simgap.robots.windows import LENGTH, RESTS, STRIKES, Window, cut, start_of
+from simgap.robots.windows import FLIES, LENGTH, RESTS, STRIKES, Window, cut, start_of
 from simgap.simulators.protocol import Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
@@ -144,7 +144,7 @@ class Composed:
                     out = self.stepped(out, name, short, value - neutral[short])
         return out
 
-    def _without_dear(self, point: Point) -> Point:
+    def _without_dear(self, point: Point) -> dict[str, Mapping[str, float]]:
         return {n: v for n, v in point.items() if not self.effects[n].dear}
 
     def stepped(
@@ -163,6 +163,10 @@ class Composed:
         if new:
             known = self.effects[name].parameters[short]
             about = self._without_dear(self.about)
+            first = [n for n in self.about if self.effects[n].dear][:1]  # the solver's step
+            if name not in first and any(w.regime != FLIES for w in self.windows):
+                # In contact what an integrator changes at one step is not what it changes at another.
+                about |= {n: self.about[n] for n in first}
             now = {**self.effects[name].neutral(), **about.get(name, {})}
             step = known.sd if now[short] + known.sd <= known.high else -known.sd
             there = {**about, name: {**now, short: now[short] + step}}

@@ -443,14 +443,15 @@ class Search:
                     break
         return None if found is best else found
 
-    def gains(self, one: FittedSet, other: FittedSet, by: FittedSet) -> np.ndarray:
-        """Log densities (folds,) of each fold given the others, of one set over another.
+    def predicts_better(self, one: FittedSet, other: FittedSet, by: FittedSet) -> bool:
+        """Whether a set predicts held-out folds better than another.
 
-        Both have the discrepancy of `by`: its size differs between motions, so that a set which leaves a
-        smaller one in some of them predicts the others no worse for it. How errors of starts grow is each
-        set's own.
+        Both have the discrepancy of `by`, one of them: its size differs between motions, so that a set which
+        leaves a smaller one in some of them predicts the others no worse for it. How errors of starts grow is
+        each set's own.
         """
-        return self._held_out(one, by) - self._held_out(other, by)
+        gain = self._held_out(one, by) - self._held_out(other, by)
+        return predicts_better(gain, _overstated(by, other if one is by else one))
 
     def _held_out(self, one: FittedSet, by: FittedSet) -> np.ndarray:
         if (one, by) not in self._densities:
@@ -467,14 +468,30 @@ class Search:
         """
         if {*one.names} < {*best.names} or one.score <= best.score:
             return one.score > best.score
-        gains = self.gains(one, best, one)
         if len(one.names) == len(best.names) and sum(one.sets.size) <= sum(best.sets.size):
-            return not predicts_better(-gains)
-        return one.score > best.score + BETTER and predicts_better(gains)
+            return not self.predicts_better(best, one, one)
+        return one.score > best.score + BETTER and self.predicts_better(one, best, one)
+
+    def _judge_twins(self, best: FittedSet, out: str) -> None:
+        """Judge in a cause's place what does the same by the same share, as a command's gain does what its
+        motor's does: where the gap is large, straight lines do not lead from nothing to both."""
+        every = {n: [*self.composed.effects[n].parameters.items()] for n in (out, *self.wanted)}
+        of_shares = [n for n, known in every.items() if [p.unit for _, p in known] == ["1"]]
+        for name in of_shares if out in of_shares else ():
+            ((short, p),), ((own, q),) = every[name], every[out]
+            at = {short: p.nominal + best.point[out][own] - q.nominal}
+            point = {**without(best.point, out), name: at}
+            apart = best.linear.target - best.linear.residual - base_at(best.composed, point).rows
+            same = np.sum(best.covariances.whitener()(apart) ** 2) < SETTLED
+            if same and name not in best.names:
+                one = self._judge(best.composed, (*best.less(out), name), point)
+                known = self.fitted.get(frozenset(one.names), one)
+                self.fitted[frozenset(one.names)] = max(one, known, key=lambda fitted: fitted.score)
 
     def _exchange(self, best: FittedSet) -> FittedSet | None:
         """A better set without one of the best's causes, least needed first, or with replacements for one."""
         for out in sorted(best.names, key=lambda out: -best.promises(best.less(out))):
+            self._judge_twins(best, out)
             less = self._without(best, out)
             if less.linear.diverged:  # nothing can be proposed about it
                 continue
@@ -489,7 +506,21 @@ def _prior_constants(sizes: Sequence[int]) -> float:
     return float(sum(gammaln((1 + k) / 2) - gammaln(0.5) - 0.5 * k * np.log(np.pi) for k in sizes))
 
 
-def predicts_better(gain: np.ndarray) -> bool:
+def _overstated(by: FittedSet, rival: FittedSet) -> float:
+    """By how much the discrepancy of a set overstates log odds over a rival; 1 if by nothing.
+
+    Where the score of a step from one to the other varies more between windows than its information says, log
+    odds are that many times too large (Royall and Tsou, JRSS B 65, 2003).
+    """
+    if not by.discrepancy:
+        return 1.0
+    left = np.nan_to_num(by.linear.residual)
+    apart = by.whiten(np.nan_to_num(rival.linear.residual) - left)
+    varies = np.sum(np.bincount(by.linear.rows.window, apart * by.whiten(left)) ** 2)
+    return max(float(varies) / max(float(apart @ apart), 1e-12), 1.0)
+
+
+def predicts_better(gain: np.ndarray, overstated: float = 1.0) -> bool:
     """Whether a set predicts held-out folds better than a rival.
 
     Either the gains are consistent between folds (a one-sided t test), or the folds' odds say so: if the
@@ -503,8 +534,9 @@ def predicts_better(gain: np.ndarray) -> bool:
 
     Args:
         gain: Gains (folds,) of log density [nats].
+        overstated: By how much the discrepancy makes them too large.
     """
-    odds = -np.log(BY_CHANCE)
+    odds = -np.log(BY_CHANCE) * overstated
     if gain.size < 2 or (gain.sum() - gain.max() > odds and gain.min() > -odds):
         return True
     return by_chance(np.arcsinh(gain)) < BY_CHANCE

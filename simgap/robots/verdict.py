@@ -35,7 +35,7 @@ from simgap.robots.fit import fit_effects
 from simgap.robots.linear import linearise
 from simgap.robots.model import Composed, Point
 from simgap.robots.rows import Phases
-from simgap.robots.search import FittedSet, Search, predicts_better
+from simgap.robots.search import FittedSet, Search
 from simgap.robots.whiten import covariances
 
 OPEN = 0.1  # chosen: a small cause is kept if it leaves at most this share of what is left without it
@@ -166,9 +166,8 @@ def verdict_on(
     right = 0.0 if doubts else known(1.0 - left)
     others = _alternatives(search, best)
     # What is too small to report, and what could replace it, is no cause and replaces none.
-    small = {*best.names} - {*causes}
-    small |= {n for s in others if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
-    sets = _explanations(others, best, small - {*causes}, right)
+    small = {n for s in (best, *others) if {*causes} <= {*s.names} for n in {*s.names} - {*causes}}
+    sets = _explanations(others, best, causes, small, right)
     matters = (bool(causes) and not doubts) or before > MATTERS * floor
     ordered = tuple(sorted(causes))
     verdict = conclude(sets, gap.p_value, matters, ordered if forced else (), ordered, record=RECORD)
@@ -224,21 +223,25 @@ def _alternatives(search: Search, best: FittedSet) -> list[FittedSet]:
             continue
         alike = one.score > best.score - np.log(RULED_OUT)
         if best.discrepancy and one.names and one.squares.sum() < most:
-            alike = alike or not predicts_better(search.gains(best, one, best))
+            alike = alike or not search.predicts_better(best, one, best)
         if alike:
             out.append(one)
     return out
 
 
 def _explanations(
-    others: Sequence[FittedSet], best: FittedSet, small: set[str], right: float
+    others: Sequence[FittedSet], best: FittedSet, causes: Sequence[str], small: set[str], right: float
 ) -> list[Explanation]:
-    """The remaining sets by weight, without `small` effects. None outweighs the best: where another is
-    likelier, held-out logs do not bear that out."""
+    """The remaining sets by weight, without `small` effects, unless only these can replace a cause there.
+    None outweighs the best: where another is likelier, held-out logs do not bear that out."""
     others_score = [np.clip(s.score, best.score - np.log(RULED_OUT), best.score) for s in others]
     score = np.array([best.score, *others_score])
     weight = np.exp(score - np.logaddexp.reduce(score))
-    each = [tuple(sorted({*s.names} - small)) for s in (best, *others)]
+    each = [{*s.names} - small for s in (best, *others)]
+    for k, one in enumerate(others, 1):
+        if each[k] < {*causes}:
+            each[k] = {*one.names} - ({*best.names} - {*causes})
+    each = [tuple(sorted(names)) for names in each]
     return [Explanation(n, float(w), n, right if n else 0.0) for n, w in zip(each, weight, strict=True)]
 
 

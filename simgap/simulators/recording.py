@@ -89,8 +89,9 @@ def read_recording(
 def _on_one_clock(log: Recording, commands: Collection[str], acts: str | None) -> Recording:
     """The rows of the column that is read most often.
 
-    Slower columns are interpolated like topics of a log. Commands count with their mean until the next row;
-    or, where all are given together and at most once a row, as they are, from when they were given.
+    Slower columns are interpolated like topics of a log, at the rows nearest to their own samples: more would
+    count noise twice. Commands count with their mean until the next row; or, where all are given together and
+    at most once a row, as they are, from when they were given.
     """
     rows = {name: np.flatnonzero(np.isfinite(values)) for name, values in log.columns.items()}
     if all(np.median(np.diff(each)) <= 1 for each in rows.values() if each.size > 1):
@@ -108,7 +109,8 @@ def _on_one_clock(log: Recording, commands: Collection[str], acts: str | None) -
     for name, values in log.columns.items():
         seen = rows[name]
         if name not in commands:
-            columns[name] = interpolated(t, log.t[seen], values[seen])[0]
+            read = np.isin(np.arange(t.size), np.searchsorted(0.5 * (t[1:] + t[:-1]), log.t[seen]))
+            columns[name] = np.where(read, interpolated(t, log.t[seen], values[seen])[0], np.nan)
             continue
         if acts in columns:
             columns[name] = values[seen[np.maximum(latest, 0)]]

@@ -469,6 +469,40 @@ FOUR_BARS = """<mujoco><worldbody>
   </worldbody><equality><connect body1="bar" body2="rocker" anchor=".3 0 0"/></equality></mujoco>"""
 
 
+@pytest.mark.parametrize(("name", "value", "stated"), [
+    (None, None, ()), ("joint:left.armature", 0.5, ('armature="0.3"', 'armature="0.5"')),
+    ("body:left.mass", 0.2, ('mass="0.1"', 'mass="0.2"')),
+    ("body:left.payload", 0.1, ('mass="0.1"', 'mass="0.2"')),
+])  # fmt: skip
+def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, value, stated):
+    finger = (
+        '<body name="{0}" pos="0 {1} 0"><joint name="{0}" type="slide" axis="0 1 0" damping="6"'
+        ' armature="{2}" frictionloss="0.6"/><geom type="box" size="0.01 0.005 0.03" mass="{3}"/></body>'
+    )
+    xml = (
+        '<mujoco><option timestep="0.001"/><worldbody>'
+        + finger.format("left", 0.1, 0.3, 0.1) + finger.format("right", -0.1, 0.25, 0.15)
+        + '</worldbody><equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality>'
+        '<actuator><position name="grip" joint="left" kp="400" kv="10"/></actuator></mujoco>'
+    )  # fmt: skip
+    described = (
+        '[columns.l]\njoint = "left"\n[columns.r]\njoint = "right"\n'
+        '[columns.u]\nactuator = "grip"\nunit = "m"\n'
+    )
+    found, t = load_mjcf(*files(xml, described)), np.arange(0, 0.5, 0.001)
+    log = Recording("a.csv", t, {"l": 0 * t, "r": 0 * t, "u": 0.02 * np.sin(9 * t)})
+    found.effects([log])
+    begun = {"l": 0.0, "l_rate": 0.0, "r": 0.0, "r_rate": 0.0}
+    read = found.simulator.simulate({name: value} if name else {}, log, begun)
+    model = mujoco.MjModel.from_xml_string(xml.replace(*stated) if stated else xml)
+    data, own = mujoco.MjData(model), []
+    for u in log["u"]:
+        own.append(data.qpos.copy())
+        data.ctrl[0] = u
+        mujoco.mj_step(model, data)
+    assert np.abs(np.column_stack([read["l"], read["r"]]) - own).max() < 1e-9
+
+
 def test_windows_begin_with_closed_loops(files):
     """What no column shows follows from what they show, and moves as the loop does."""
     columns = '[columns.c]\njoint = "crank"\n[columns.r]\njoint = "rock"\n'

@@ -1,9 +1,11 @@
 """Robots that touch things: when; poses that one instrument reads; what each log has of its own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from simgap.robot_effects import readouts
+from simgap.robot_effects import effects_of, readouts
 from simgap.robot_effects.base import Setting
 from simgap.robots.linear import base_at, linearise, with_wobble
 from simgap.robots.model import Composed
@@ -187,3 +189,34 @@ def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
             channel = composed.rows.channels.index(name.split(",")[0])
             assert (column == (composed.rows.channel[block.rows] == channel)).all()
             assert (source.covariance == 1.0).all()
+
+
+ARM = """<mujoco><option timestep="{}" integrator="{}" gravity="0 0 0"/>
+  <worldbody><body><joint name="turn" axis="0 0 1" armature="0.02" damping="0.1"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.8"/></body></worldbody>
+  <actuator><position name="servo" joint="turn" kp="40" kv="2"/></actuator></mujoco>"""
+TURN = '[columns.q]\njoint = "turn"\n[columns.u]\nactuator = "servo"\nunit = "rad"\n'
+
+
+def test_in_contact_a_fourth_of_the_step_by_another_integrator_is_the_run_itself(tmp_path):
+    pytest.importorskip("mujoco")
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    def load(step: float, integrator: str):
+        (tmp_path / "arm.xml").write_text(ARM.format(step, integrator))
+        (tmp_path / "map.toml").write_text(TURN)
+        return load_mjcf(tmp_path / "arm.xml", tmp_path / "map.toml")
+
+    found, t = load(0.008, "implicitfast"), np.arange(0, 1, 0.008)
+    goal = np.where(t > 0.3, 1.0, 0.0)
+    log = Recording("a.csv", t, {"q": 0.3 * np.cos(3.0 * t), "u": goal})
+    effects = effects_of(found.simulator, [log], found.effects([log]))
+    point = {"option.timestep": {"timestep": -0.75}, "option.integrator": {"integrator": 1.0}}
+    composed = Composed.of(found.simulator, [log], effects, {"q": 1e-4}).moved(point)
+    composed = replace(composed, windows=tuple(replace(w, regime=STRIKES) for w in composed.windows))
+    starts = composed.starts(point)
+    finer = load(0.002, "Euler")
+    finer.effects([log])
+    for window, start, ours in zip(composed.windows, starts, composed.rolled(point, starts), strict=True):
+        own = finer.simulator.simulate({}, log.window(window.begin, window.end), start)
+        np.testing.assert_allclose(ours["q"], own["q"], atol=1e-9)

@@ -66,6 +66,17 @@ def test_a_large_cause_is_proposed_near_its_size():
     assert found["viscous"]["viscous"] == pytest.approx(0.1, rel=0.1)
 
 
+def test_what_does_the_same_by_the_same_share_is_judged_too():
+    model = composed(Swing(), [log(s, torque_scale=1.4) for s in range(2)])
+    search = Search(model, tuple(model.effects), model.rows.log)
+    best = search.forced(("torque_scale",))
+    search._judge_twins(best, "torque_scale")
+    (twin,) = {*search.fitted} - {frozenset(), frozenset(best.names)}
+    assert twin == {"command:torque.gain"}
+    assert search.fitted[twin].score == pytest.approx(best.score, abs=2.0)
+    assert search.fitted[twin].point["command:torque.gain"]["gain"] == pytest.approx(0.4, abs=0.01)
+
+
 def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing, names = search.nothing(), tuple(damped.effects)
@@ -127,9 +138,10 @@ def test_rivals_are_fitted_to_the_end_before_they_are_ruled_out(damped, monkeypa
 @pytest.mark.parametrize(("gain", "better"), [(0.0, True), (9.0, True), (-9.0, False)])
 def test_of_what_explains_alike_the_simpler_is_preferred(damped, monkeypatch, gain, better):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
-    monkeypatch.setattr(search, "gains", lambda *_: np.full(4, gain))
+    held_out = {"coulomb": np.full(4, gain), "stribeck": np.zeros(4)}
+    monkeypatch.setattr(search, "_held_out", lambda one, _: held_out[one.names[0]])
     one, two = (
-        SimpleNamespace(names=(n,), score=score, sets=SimpleNamespace(size=size))
+        SimpleNamespace(names=(n,), score=score, sets=SimpleNamespace(size=size), discrepancy={})
         for n, score, size in (("coulomb", 0.5, (1,)), ("stribeck", 0.0, (2,)))
     )
     assert search._is_better(one, two) is better

@@ -123,6 +123,19 @@ def test_a_large_misreading_moves_starts_farther_than_along_straight_lines(name)
     np.testing.assert_allclose(one.shift, base_at(model, {name: there}).rows - base.rows, atol=1e-12)
 
 
+@pytest.mark.parametrize(("name", "value"), [("lag", 0.02), ("lowpass", 0.03)])
+def test_a_reading_s_past_is_undone_from_the_samples_that_are_there(name, value):
+    """Of a column read at every second row as of the same column in rows of its own."""
+    whole = log(3)
+    gaps = np.where(np.arange(len(whole)) % 2, np.nan, whole["angle"])
+    own = Recording(whole.name, whole.t[::2], {n: v[::2] for n, v in whole.columns.items()})
+    effect = composed([whole]).effects[f"readout:angle.{name}"]
+    undone, expected = (effect.restore(r, {n: value for n in effect.parameters})["angle"]
+                        for r in (whole.with_columns({"angle": gaps}), own))  # fmt: skip
+    np.testing.assert_array_equal(undone[::2], expected)
+    assert np.isnan(undone[1::2]).all()
+
+
 def test_an_effect_at_its_value_leaves_noise_alone():
     recording = log(5)
     late = delayed(recording.t - recording.t[0], recording["angle"], 0.01)

@@ -10,9 +10,9 @@ from scipy.integrate import quad
 from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
-from simgap.robots.search import predicts_better
+from simgap.robots.search import FittedSet, _overstated, predicts_better
 from simgap.robots.sets import Sets, neighbours, pairs
-from simgap.robots.verdict import _absurd, _score_of_noise
+from simgap.robots.verdict import _absurd, _explanations, _score_of_noise
 from simgap.robots.whiten import Block, Covariances, Discrepancy, Source
 
 NAMES = ("a", "b", "c")
@@ -162,6 +162,39 @@ def test_a_set_predicts_better_only_where_logs_agree():
     assert predicts_better(np.array([9.0, 370.0, 21.0]))  # much, and in one log far more
     assert not predicts_better(np.array([0.3, 37.0, -8.7]))  # one log is predicted worse
     assert not predicts_better(np.array([0.3, 370.0, 0.2]))  # one log alone says so
+
+
+def test_log_odds_count_less_where_residuals_vary_more_than_their_discrepancy():
+    rng, window = np.random.default_rng(0), np.arange(2000) // 20
+    apart = np.sin(np.arange(2000) / 7.0)
+
+    def one(residual: np.ndarray, discrepancy: dict[str, float]) -> FittedSet:
+        linear = SimpleNamespace(residual=residual, rows=SimpleNamespace(window=window))
+        return SimpleNamespace(linear=linear, discrepancy=discrepancy, whiten=lambda values: values)  # type: ignore[return-value]
+
+    white = rng.standard_normal(2000)
+    again = white + apart * (1.0 / np.sqrt(10.0) * np.repeat(rng.standard_normal(100), 20)) * np.sqrt(3.0)
+    for left, expected in ((white, 1.0), (again, 4.0)):
+        by = one(left, {"q": 1.0})
+        assert _overstated(by, one(left + apart, {})) == pytest.approx(expected, rel=0.35)
+        assert _overstated(one(left, {}), one(left + apart, {})) == 1.0
+    gain = np.array([1.2, 34.6, 1.2, -0.5, 1.0, 0.5])
+    assert predicts_better(gain) and not predicts_better(gain, 1.6)
+
+
+def test_what_replaces_a_cause_is_told_although_it_could_replace_a_small_effect_too():
+    sets = [
+        SimpleNamespace(names=names, score=score)
+        for names, score in [(("load", "hold", "hum"), 0.0), (("load", "hold", "lag"), -1.0),
+                             (("load", "lag", "hum"), -9.0), (("load", "gain", "lag"), -9.0)]
+    ]  # fmt: skip
+    found = _explanations(sets[1:], sets[0], ("hold", "load"), {"hum", "lag"}, 1.0)  # type: ignore[arg-type]
+    assert [one.causes for one in found] == [
+        ("hold", "load"),
+        ("hold", "load"),
+        ("lag", "load"),
+        ("gain", "load"),
+    ]
 
 
 def test_what_starts_make_of_a_residual_is_taken_from_it():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hmmseg.errors import InputError
+from simgap.robots.rows import estimate_noise
 from simgap.simulators.protocol import Job, Simulator, run_all
 from simgap.simulators.recording import Recording, read_recording
 from simgap.simulators.user import load_simulator, restarts
@@ -155,6 +156,20 @@ def test_a_missing_file_and_a_spec_without_a_name():
         load_simulator("robot.py")
     with pytest.raises(InputError, match=r"no such file missing\.py"):
         load_simulator("missing.py:Robot")
+
+
+def test_a_slower_column_has_no_more_samples_than_were_read(tmp_path):
+    path, rng = tmp_path / "log.csv", np.random.default_rng(0)
+    fast, slow = rng.standard_normal(200), rng.standard_normal(200)
+    path.write_text("t,x,y\n" + "".join(
+        f"{0.01 * i:.2f},{fast[i]:.6f},{'' if i % 2 else f'{slow[i]:.6f}'}\n" for i in range(200)
+    ))  # fmt: skip
+    log = read_recording(path, ["x", "y"])
+    assert np.isfinite(log["x"]).all() and np.flatnonzero(np.isfinite(log["y"])).tolist() == [
+        *range(0, 200, 2)
+    ]
+    assert log["y"][::2] == pytest.approx(slow[::2], abs=1e-6)
+    assert estimate_noise([log], "y") == pytest.approx(1.0, rel=0.3)  # filled in between, it was nothing
 
 
 def test_logs_with_their_own_name_for_time(tmp_path):

@@ -28,6 +28,7 @@ from simgap.simulators.mjcf.setting import (
     name_of,
     nothing,
     object_id,
+    only_slides,
     payload,
     payload_place,
     setting_of,
@@ -184,7 +185,7 @@ class _Catalogue:
         mass, centre = float(m.body_mass[body]), f"body:{name}.com"
         self.add(f"body:{name}.mass", SIZE * mass, f"mass (and inertia) of {name}", low=1e-3 * mass)
         gyration = float(np.sqrt(m.body_inertia[body].sum() / mass))
-        for axis in "xyz":
+        for axis in "" if only_slides(m, body) else "xyz":
             self.add(f"{centre}_{axis}", SIZE * gyration, f"centre of mass of {name}", effect=centre)
 
     def _tool(self, body: int) -> int:

@@ -24,6 +24,7 @@ from simgap.simulators.mjcf.setting import (
     name_of,
     names_of,
     object_id,
+    only_slides,
     setting_of,
 )
 from simgap.simulators.protocol import Channel
@@ -119,9 +120,11 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
         if isinstance(place, str):
             check(f"payload_at.{body}", "site", place, names_of(plain, "site"))
     address = _add_sensors(spec, described.columns)
-    for body in spec.bodies:  # else centres of mass could not be moved in the compiled model
+    # Else centres of mass could not be moved in the compiled model. Only of what is simple MuJoCo leaves the
+    # rotor out where it reckons how softly ties and friction hold it.
+    for body in spec.bodies:
         if hasattr(body, "simple"):
-            body.simple = False
+            body.simple = only_slides(plain, body.id)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if not np.any((plain.geom_contype != 0) | (plain.geom_conaffinity != 0)):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # an eighth of a small robot's time
@@ -329,7 +332,7 @@ def _clipped(simulator: MjcfSimulator, log: Recording, file: str) -> list[str]:
 
 def continuous(log: Recording, turn: Sequence[str]) -> Recording:
     """Quaternion columns whose signs do not jump: q and -q are the same rotation."""
-    quat = np.array([log[n] for n in turn])
+    quat = np.array([held(log[n]) for n in turn])
     dot = np.nansum(quat[:, 1:] * quat[:, :-1], 0)
     sign = np.cumprod(np.concatenate([[1.0], np.where(dot < 0, -1.0, 1.0)]))
     return log.with_columns({n: sign * log[n] for n in turn})

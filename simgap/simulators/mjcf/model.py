@@ -89,15 +89,21 @@ class MjcfSimulator:
         for key, mine in groups.items():
             mixed = [(n, v) for n, v in key if self.settings[n].mixed is not None]
             changed = tuple((n, v) for n, v in key if self.settings[n].mixed is None)
-            for i, channels in zip(mine, self._all([jobs[i] for i in mine], changed), strict=True):
+            for i, channels in zip(mine, self._mixed([jobs[i] for i in mine], changed, mixed), strict=True):
                 out[i] = channels
-            for name, value in mixed:
-                far = self.settings[name].mixed
-                assert far is not None
-                other = self._all([jobs[i] for i in mine], (*changed, (name, far)))
-                for i, channels in zip(mine, other, strict=True):
-                    out[i] = _mixed(out[i], channels, value / far)
         return out
+
+    def _mixed(
+        self, jobs: Sequence[Job], changed: tuple[tuple[str, float], ...], mixed: Sequence[tuple[str, float]]
+    ) -> list[Channels | None]:
+        """All jobs' channels, linear in each of the `mixed` settings between their two runs."""
+        if not mixed:
+            return self._all(jobs, changed)
+        (name, value), *rest = mixed
+        far = self.settings[name].mixed
+        assert far is not None
+        near, away = (self._mixed(jobs, (*changed, *c), rest) for c in ((), ((name, far),)))
+        return [_mixed(a, b, value / far) for a, b in zip(near, away, strict=True)]
 
     def _all(self, jobs: Sequence[Job], changed: tuple[tuple[str, float], ...]) -> list[Channels | None]:
         """All jobs' channels with some settings changed."""

@@ -157,6 +157,11 @@ def _joint(model: Any, name: str, attribute: str) -> Setting | None:
     return _field(f"joint:{name}.{attribute}", unit, model, array, at, attribute == "armature")
 
 
+def only_slides(model: Any, body: int) -> bool:
+    """Whether where a body's mass lies moves nothing, so that MuJoCo may count it as simple."""
+    return int(model.body_simple[body]) == 2
+
+
 def _body(model: Any, name: str, attribute: str) -> Setting | None:
     if attribute == "payload":
         return payload(model, name, payload_place(model, name))
@@ -168,7 +173,7 @@ def _body(model: Any, name: str, attribute: str) -> Setting | None:
             m.body_mass[b], m.body_inertia[b] = value, inertia * (value / mass)
 
         return Setting(whole, "kg", mass, put, True)
-    if attribute in ("com_x", "com_y", "com_z"):
+    if attribute in ("com_x", "com_y", "com_z") and not only_slides(model, b):
         return _field(whole, "m", model, "body_ipos", (b, "xyz".index(attribute[-1])), True)
     if attribute == "length" and np.any(model.body_pos[b]):
         return Setting(whole, "1", 0.0, _larger(model, ("body_pos", b)), True)
@@ -180,6 +185,7 @@ def payload(model: Any, name: str, place: np.ndarray) -> Setting:
     b = object_id(model, "body", name)
     mass, inertia = float(model.body_mass[b]), np.array(model.body_inertia[b])
     com = np.array(model.body_ipos[b])
+    place = com if only_slides(model, b) else place
 
     def load(m: Any, value: float) -> None:
         total = mass + value
