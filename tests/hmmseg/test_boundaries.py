@@ -228,6 +228,22 @@ def test_ninety_percent_intervals_cover(case):
     assert 0.86 < share < 0.99, share
 
 
+@pytest.mark.parametrize("gap", [0.25, 0.5])
+def test_intervals_cover_a_landing_within_a_gap_that_does_not_stop_the_hand(gap):
+    rng, held, t = np.random.default_rng(8), [], np.linspace(0.0, 1.0, 2001)
+    for _ in range(200):
+        way, duration, deep = rng.uniform(0.03, 0.05), rng.uniform(0.9, 1.3), rng.uniform(3e-4, 6e-4)
+        crossing = duration * np.interp(1 - deep / way, _minimum_jerk(t), t)
+        start = crossing - gap * rng.uniform()
+        ends = np.array([start, start + gap]) / duration
+        left, right = way * (_minimum_jerk(ends) - 1) + deep
+        rates = way * _minimum_jerk_slope(ends) / duration
+        density = crossing_density([Crossing(left, right, *rates, 1e-5, 1e-5, 2e-3, "impact")], gap)
+        low, high = quantiles(density, [0.05, 0.95]) * gap / WIDTH
+        held.append(low <= crossing - start <= high)
+    assert np.mean(held) > 0.84
+
+
 def sensed(p, sd_pressed=3e-6, sd_place=3e-5, seed=0, **others):
     """A contact of known penetration, with noise."""
     rng = np.random.default_rng(seed)
