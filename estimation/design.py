@@ -361,7 +361,8 @@ def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int])
     with np.errstate(divide="ignore", invalid="ignore"):  # channels without readings
         for move in moves:
             part = {k: noise.variance[k] / n for k, n in weighed.counts[move].items()}
-            out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
+            rounded = weighed.rounding[1::2].sum() ** 2  # fingers that share a load are rounded alike
+            out.append([part["force"] + rounded, part["distance"], part["pickup"] + part["place"]])
     return np.moveaxis(np.array(out), 2, 0)
 
 
@@ -396,7 +397,7 @@ def free_means(
     mean = np.stack([free_forces(a.signals, a) for a in weighed])
     count = np.array([max(a.free_count, 1.0) for a in weighed])
     of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
-    variance = of_sample[None, :] / count[:, None]
+    variance = of_sample[None, :] / count[:, None] + np.array([a.rounding**2 for a in weighed])
     moved = np.stack([_moved_zero(a, free_steps, rig) for a in weighed])
     return mean, variance + moved**2, moved.max(axis=0)
 
@@ -409,7 +410,8 @@ def _zeros(a: WeighedTrial, free_steps: Sequence[int]) -> tuple[np.ndarray, np.n
         return np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
     each = [np.stack([getattr(a.signals, name)[half] for name in FORCE_CHANNELS]) for half in halves]
     noise = [[r.var() * autocorrelation_time([r - r.mean()]) for r in four] for four in each]
-    errors = np.sqrt([(np.median(noise, axis=0) + LEAST**2) / half.size for half in halves])
+    spread = np.median(noise, axis=0) + LEAST**2
+    errors = np.sqrt([spread / half.size + a.rounding**2 for half in halves])
     means = np.array([four.mean(axis=1) for four in each])
     return np.array([a.signals.t[half].mean() for half in halves]), means, errors
 

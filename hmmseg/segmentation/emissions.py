@@ -32,7 +32,7 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, central_differences, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
-from hmmseg.robust import extent, median_of_known, white_sd
+from hmmseg.robust import coarse_step, extent, median_of_known, white_sd
 from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
@@ -278,9 +278,9 @@ WINDOW = 6e-3  # chosen: s over which a reading is averaged; contacts change no 
 
 
 def noise_sd(values: np.ndarray) -> float:
-    """Robust standard deviation of white sample noise; NaN for fewer than three samples."""
+    """Robust standard deviation of white sample noise, and of rounding; NaN for fewer than three samples."""
     finite = values[np.isfinite(values)]
-    return float(white_sd(finite)) if finite.size > 2 else np.nan
+    return max(float(white_sd(finite)), coarse_step(finite) / np.sqrt(12)) if finite.size > 2 else np.nan
 
 
 def channel_sd(stated: np.ndarray, values: np.ndarray) -> float:

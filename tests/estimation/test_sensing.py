@@ -123,6 +123,14 @@ def assert_no_number_misleads(found, named):
                 assert found.reasons[f"{obj}.{prop}"]
 
 
+def test_forces_in_steps_coarser_than_their_noise_are_known_no_better():
+    rounded = {name: 0.25 * np.round(TABLE[name] / 0.25) for name in FORCES}
+    found = identify(TABLE | rounded, FOLDER / "task.toml", FOLDER / "rig.toml")
+    for obj, props in TRUTH.items():
+        low, high = np.quantile(found.of(obj, "weight"), [0.01, 0.99])
+        assert low <= props["weight"] <= high, (obj, low, high)
+
+
 def hand(wider=0.0, higher=0.0, **links):
     def alter(rig):
         for name, finger in rig["fingers"].items():
