@@ -32,7 +32,7 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, central_differences, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
-from hmmseg.robust import coarse_step, extent, median_of_known, white_sd
+from hmmseg.robust import coarse_step, extent, filled, median_of_known, white_sd
 from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
@@ -75,11 +75,11 @@ class Features(Brief):
         return (self.force[:, 0] - self.force[:, 2]) / 2
 
     def block_width(self, bias: np.ndarray) -> np.ndarray:
-        """Width of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        """Width of the held block (num_timesteps,) [m]; forces are bridged where both are missing."""
         return block_width(self.d, *_pair(self.force - bias, 0, 2, -1.0), self.pads)
 
     def block_y(self, bias: np.ndarray) -> np.ndarray:
-        """Height of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        """Height of the held block (num_timesteps,) [m]; forces are bridged where both are missing."""
         return block_y(self.y, *_pair(self.force - bias, 1, 3, 1.0), self.pads)
 
     @cached_property
@@ -105,10 +105,21 @@ class Features(Brief):
 
 
 def _pair(force: np.ndarray, first: int, second: int, sign: float) -> tuple[np.ndarray, np.ndarray]:
-    """Forces of both fingers (num_timesteps,): a missing one is the other times `sign`, 0 without both."""
+    """Forces of both fingers (num_timesteps,): one missing is the other times `sign`, both are bridged."""
     pair = force[:, first], force[:, second]
     a, b = (np.where(np.isnan(own), sign * other, own) for own, other in (pair, pair[::-1]))
-    return np.nan_to_num(a), np.nan_to_num(b)
+    return filled(a), filled(b)
+
+
+def _unseen(force: np.ndarray, first: int, second: int, sign: float) -> np.ndarray:
+    """Error (num_timesteps,) [N] of forces bridged where both are missing: half of the change meanwhile."""
+    shown = np.where(np.isnan(force[:, first]), sign * force[:, second], force[:, first])
+    known, every = np.flatnonzero(np.isfinite(shown)), np.arange(shown.size)
+    if not known.size:
+        return np.zeros(shown.size)
+    later, earlier = np.searchsorted(known, every), np.searchsorted(known, every, side="right") - 1
+    change = shown[known[np.minimum(later, known.size - 1)]] - shown[known[np.maximum(earlier, 0)]]
+    return np.abs(change) / 2
 
 
 @dataclass(frozen=True)
@@ -335,11 +346,13 @@ def features(signals: Signals, rig: Rig) -> Features:
         "force": 1.5 * float(np.nanmax(np.abs(force))) + 1e-3,
         "press": 1.5 * float(np.max(np.abs(s.fy), initial=0.0, where=np.isfinite(s.fy))) + 1e-3,
     }
+    pads = pads_of(rig)
+    sd_d = np.hypot(2 * stated(s.sd_x, s.distance / 2), _unseen(force, 0, 2, -1.0) * 2 * pads.normal1)
     return Features(
-        t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y,
-        d=s.distance, sd_y=stated(s.sd_y, s.y), sd_d=2 * stated(s.sd_x, s.distance / 2),
+        t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y, d=s.distance,
+        sd_y=np.hypot(stated(s.sd_y, s.y), _unseen(force, 1, 3, 1.0) * pads.shear1), sd_d=sd_d,
         sd_vx=stated(s.sd_vx, s.vx), sd_vy=stated(s.sd_vy, s.vy),
-        pads=pads_of(rig), gravity=rig.gravity, span=span, free=s.free,
+        pads=pads, gravity=rig.gravity, span=span, free=s.free,
     )  # fmt: skip
 
 

@@ -204,7 +204,8 @@ def contact_changes(
         probability = posterior.moves[0][:, k]
         prior = Prior(t, probability, (edges[k], edges[k + 2]))
         n = int(probability.argmax())
-        out.append(table.change(steps[k], steps[k + 1], prior, _held_side(t, path, steps, k, n)))
+        held = _held_side(reading.features, path, steps, k, n)
+        out.append(table.change(steps[k], steps[k + 1], prior, held))
     return out
 
 
@@ -234,14 +235,21 @@ def nearest_touch(touches: Touches, boundary: BoundaryPosterior) -> BoundaryPost
 
 
 def _held_side(
-    t: np.ndarray, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
+    f: Features, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
 ) -> tuple[float, float]:
-    """Nearest stretch [s] to interval n of the subtask that rests on the ground, before or after it."""
+    """Nearest stretch [s] to interval n of the subtask that rests on the ground, before or after it.
+
+    Nearest are the first samples with forces, if it has any.
+    """
+    t, shown = f.t, np.isfinite(f.force).all(axis=1)
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
+    read = own[shown[own]]
     if after:
-        return t[n + 1], min(t[n + 1] + DRIFTS, max(t[own[-1]] if own.size else 0.0, t[n + 1]))
-    return max(t[n] - DRIFTS, min(t[own[0]] if own.size else np.inf, t[n])), t[n]
+        first = t[min(read[read > n], default=n + 1)]
+        return first, min(first + DRIFTS, max(t[own[-1]] if own.size else 0.0, first))
+    last = t[max(read[read <= n], default=n)]
+    return max(last - DRIFTS, min(t[own[0]] if own.size else np.inf, last)), last
 
 
 def to_spans(
