@@ -407,7 +407,7 @@ def _zeros(a: WeighedTrial, free_steps: Sequence[int]) -> tuple[np.ndarray, np.n
     spans = [np.flatnonzero((a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0)) for k in free_steps]
     halves = [half for span in spans for half in np.array_split(span, 2) if half.size >= MIN_FREE]
     if not halves:
-        return np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
+        return np.zeros(1), np.zeros((1, 4)), np.ones((1, 4))
     each = [np.stack([getattr(a.signals, name)[half] for name in FORCE_CHANNELS]) for half in halves]
     noise = [[r.var() * autocorrelation_time([r - r.mean()]) for r in four] for four in each]
     spread = np.median(noise, axis=0) + LEAST**2
@@ -430,17 +430,14 @@ def zero_drift(a: WeighedTrial, free_steps: Sequence[int]) -> np.ndarray:
 def without_drift(one: TrialAlignment, drift: np.ndarray) -> TrialAlignment:
     """The trial less a drift (4,) of its forces' zeros [N/s]."""
     since = one.trial.t - one.trial.t.mean()
-    ours = {name: since * d for name, d in zip(FORCE_CHANNELS, drift, strict=True)}
-    channels = one.trial.channels | {name: one.trial.channels[name] - v for name, v in ours.items()}
-    signals = replace(one.signals, **{name: getattr(one.signals, name) - v for name, v in ours.items()})
-    return replace(one, trial=replace(one.trial, channels=channels), signals=signals)
+    ours = {f: one.trial.channels[f] - since * d for f, d in zip(FORCE_CHANNELS, drift, strict=True)}
+    trial = replace(one.trial, channels=one.trial.channels | ours)
+    return replace(one, trial=trial, signals=replace(one.signals, **ours))
 
 
 def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], rig: Rig) -> np.ndarray:
     """Largest deviation (4,) [N] of forces in half a free stretch from the mean of all; 0 if due to noise."""
     _, means, errors = _zeros(a, free_steps)
-    if len(means) < 2:
-        return np.zeros(len(FORCE_CHANNELS))
     allowed = SURE * np.hypot(errors.max(axis=0) + errors, rig.systematic.force_bias)
     off = np.abs(means - means.mean(axis=0))
     return np.where((off > allowed).any(axis=0), off.max(axis=0), 0.0)

@@ -175,8 +175,7 @@ def identify_aligned(
     free = [step.index for step in aligned.subtasks if step.state == FREE]
     drift, recorded = np.array([zero_drift(a, free) for a in weighed]), aligned
     if drift.any():
-        steady = map(without_drift, aligned.trials, drift)
-        aligned = replace(aligned, trials=tuple(steady))
+        aligned = replace(aligned, trials=tuple(map(without_drift, aligned.trials, drift)))
         weighed, noise = aligned_weights(aligned, rng)
     design = build(aligned, weighed, noise)
     post = posterior(design) if design.unknowns else None
@@ -215,14 +214,10 @@ def identify_aligned(
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
     ]
-    warnings += [
-        f"the zero of {name} drifts by {size:.2g} N/s, which is removed"
-        for name, size in zip(FORCE_CHANNELS, np.abs(drift).max(axis=0), strict=True) if size > 0
-    ]  # fmt: skip
-    warnings += [
-        f"the zero of {name} moves by {size:.2g} N between stretches of free motion; intervals allow for it"
-        for name, size in zip(FORCE_CHANNELS, design.moved, strict=True) if size > 0
-    ]  # fmt: skip
+    drifts = "drifts by {:.2g} N/s, which is removed", np.abs(drift).max(axis=0)
+    moves = "moves by {:.2g} N between stretches of free motion; intervals allow for it", design.moved
+    warnings += [f"the zero of {name} {text.format(size)}" for text, sizes in (drifts, moves)
+                 for name, size in zip(FORCE_CHANNELS, sizes, strict=True) if size > 0]  # fmt: skip
     warnings += dict.fromkeys(contradicted.values())
     warnings += [*soft_pads(design, rig), *unnamed(task, design), *dense(task, rig, means)]
     friction = {

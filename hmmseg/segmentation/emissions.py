@@ -19,7 +19,6 @@ docs/segmentation.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -32,7 +31,7 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, central_differences, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
-from hmmseg.robust import coarse_step, extent, filled, median_of_known, white_sd
+from hmmseg.robust import coarse_step, extent, filled, median_of_known, runs, white_sd
 from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
@@ -88,17 +87,6 @@ class Features(Brief):
         return {"d": float(np.median(self.sd_d)), "y": float(np.median(self.sd_y))}
 
     @cached_property
-    def resolution(self) -> float:
-        """Standard deviation [N] of what rounding of the forces to a step adds; about 0 without one.
-
-        Nearly all small changes between readings are one step then, so that most readings of a free finger
-        are the same, and no scale can be learned from them.
-        """
-        change = np.abs(np.diff(self.force, axis=0))
-        change = change[change > 0]
-        return float(np.quantile(change, 0.1)) / math.sqrt(12) if change.size else 0.0
-
-    @cached_property
     def carrying(self) -> np.ndarray:
         """Net vertical force on a lifted block, in units of its weight (num_timesteps,)."""
         return carried_force(1.0, np.nan_to_num(self.ay), self.gravity)
@@ -113,13 +101,11 @@ def _pair(force: np.ndarray, first: int, second: int, sign: float) -> tuple[np.n
 
 def _unseen(force: np.ndarray, first: int, second: int, sign: float) -> np.ndarray:
     """Error (num_timesteps,) [N] of forces bridged where both are missing: half of the change meanwhile."""
-    shown = np.where(np.isnan(force[:, first]), sign * force[:, second], force[:, first])
-    known, every = np.flatnonzero(np.isfinite(shown)), np.arange(shown.size)
-    if not known.size:
-        return np.zeros(shown.size)
-    later, earlier = np.searchsorted(known, every), np.searchsorted(known, every, side="right") - 1
-    change = shown[known[np.minimum(later, known.size - 1)]] - shown[known[np.maximum(earlier, 0)]]
-    return np.abs(change) / 2
+    one, other = force[:, first], sign * force[:, second]
+    shown, out = np.where(np.isnan(one), other, one), np.zeros(one.size)
+    for start, stop in runs(np.isnan(shown)):
+        out[start:stop] = np.ptp(shown[[max(start - 1, 0), min(stop, shown.size - 1)]]) / 2
+    return np.nan_to_num(out)
 
 
 @dataclass(frozen=True)

@@ -237,18 +237,16 @@ def nearest_touch(touches: Touches, boundary: BoundaryPosterior) -> BoundaryPost
 def _held_side(
     f: Features, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
 ) -> tuple[float, float]:
-    """Nearest stretch [s] to interval n of the subtask that rests on the ground, before or after it.
-
-    Nearest are the first samples with forces, if it has any.
-    """
-    t, shown = f.t, np.isfinite(f.force).all(axis=1)
+    """Nearest stretch [s] to interval n, with forces if there are any, of the subtask that rests on the
+    ground, before or after it."""
+    t = f.t
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
-    read = own[shown[own]]
+    read = [i for i in own if np.isfinite(f.force[i]).all()]
     if after:
-        first = t[min(read[read > n], default=n + 1)]
+        first = t[min((i for i in read if i > n), default=n + 1)]
         return first, min(first + DRIFTS, max(t[own[-1]] if own.size else 0.0, first))
-    last = t[max(read[read <= n], default=n)]
+    last = t[max((i for i in read if i <= n), default=n)]
     return max(last - DRIFTS, min(t[own[0]] if own.size else np.inf, last)), last
 
 
