@@ -27,6 +27,7 @@ from hmmseg.io.trial import (
     CARTESIAN_CHANNELS,
     CARTESIAN_OPTIONAL,
     JOINT_CHANNELS,
+    MIN_SAMPLES,
     Trial,
     mapped_times,
     trial_of,
@@ -130,7 +131,8 @@ def _clock(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None
     try:
         return *mapped_times(table, rig), []
     except InputError as error:
-        return None, None, [str(error)] if "t" in {*table.names, *rig.columns} else []
+        there = "t" in {*table.names, *rig.columns} and table.rows.size >= MIN_SAMPLES
+        return None, None, [str(error)] if there else []
 
 
 def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:

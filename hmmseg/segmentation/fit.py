@@ -64,8 +64,9 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
 
 
 def _least_force(features: Sequence[Features]) -> float:
-    """Least noise [N] of a force: what rounding to steps adds, in the median channel of all trials."""
-    return max(float(np.median([coarse_step(c) for f in features for c in f.force.T])) / np.sqrt(12), 1e-6)
+    """Least noise [N] of a force: what rounding to steps adds, in the median trial."""
+    steps = [max(coarse_step(force) for force in f.force.T) for f in features]
+    return max(float(np.median(steps)) / np.sqrt(12), 1e-6)
 
 
 def chain_of(shares: np.ndarray, length: int) -> Chain:

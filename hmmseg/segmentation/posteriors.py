@@ -80,7 +80,7 @@ class Contacts:
         place = place - median_of_known((place - (own + other) / 2)[held])
         sd_place, sd_rate = self.sd["inward"], self.sd["inward_rate"]
         if making:
-            other = np.maximum(other, 0.0)
+            other = np.where(np.isnan(self.compression[1 - i]), place, np.maximum(other, 0.0))
             place, rate = 2 * place - other, 2 * rate - one_sided(self.signals.t, other)[0]
             sd_place, sd_rate = np.sqrt(2) * sd_place, np.sqrt(2) * sd_rate
         # An error of the pad's stiffness shifts the face.
