@@ -25,9 +25,11 @@ import numpy as np
 
 from estimation.observations import (
     CHANNELS,
+    LEAST,
     MIN_FREE,
     Noise,
     WeighedTrial,
+    autocorrelation_time,
     channel_values,
     free_forces,
     gravity_factor,
@@ -49,7 +51,7 @@ from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
-from hmmseg.segmentation.align import AlignedTrials
+from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.emissions import thin
 
 Terms = dict[str, int]
@@ -293,8 +295,6 @@ def nuisances(
     return tuple(out)
 
 
-ZERO_SHARE = 0.05  # limit: share of the largest force; a zero that drifts less matters less than other errors
-
 # Slopes that show the pads, by name in `WeighedTrial.slopes`: their channel, and the readings they weigh.
 SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing": (RISE, "place")}
 
@@ -361,7 +361,8 @@ def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int])
     with np.errstate(divide="ignore", invalid="ignore"):  # channels without readings
         for move in moves:
             part = {k: noise.variance[k] / n for k, n in weighed.counts[move].items()}
-            out.append([part["force"], part["distance"], part["pickup"] + part["place"]])
+            rounded = weighed.rounding[1::2].sum() ** 2  # fingers that share a load are rounded alike
+            out.append([part["force"] + rounded, part["distance"], part["pickup"] + part["place"]])
     return np.moveaxis(np.array(out), 2, 0)
 
 
@@ -388,36 +389,58 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
 def free_means(
     weighed: Sequence[WeighedTrial], noise: Noise, free_steps: Sequence[int], rig: Rig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean forces in free motion (num_trials, 4), their variances, and the drift of each zero (4,) [N].
+    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N].
 
-    A zero that drifts between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
+    A zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
     the rig's own bias allow, is known in a grip no better than these stretches agree.
     """
     mean = np.stack([free_forces(a.signals, a) for a in weighed])
     count = np.array([max(a.free_count, 1.0) for a in weighed])
     of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
-    variance = of_sample[None, :] / count[:, None]
-    moved = np.stack([_moved_zero(a, free_steps, of_sample, rig) for a in weighed])
+    variance = of_sample[None, :] / count[:, None] + np.array([a.rounding**2 for a in weighed])
+    moved = np.stack([_moved_zero(a, free_steps, rig) for a in weighed])
     return mean, variance + moved**2, moved.max(axis=0)
 
 
-def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], variance: np.ndarray, rig: Rig) -> np.ndarray:
-    """Largest deviation (4,) [N] of a free stretch's forces from the mean of all; 0 if due to noise."""
+def _zeros(a: WeighedTrial, free_steps: Sequence[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean times (N,) of halves of free stretches of a trial, mean forces (N, 4) there, and their errors."""
+    spans = [np.flatnonzero((a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0)) for k in free_steps]
+    halves = [half for span in spans for half in np.array_split(span, 2) if half.size >= MIN_FREE]
+    if not halves:
+        return np.zeros(1), np.zeros((1, 4)), np.ones((1, 4))
+    each = [np.stack([getattr(a.signals, name)[half] for name in FORCE_CHANNELS]) for half in halves]
+    noise = [[r.var() * autocorrelation_time([r - r.mean()]) for r in four] for four in each]
+    spread = np.median(noise, axis=0) + LEAST**2
+    errors = np.sqrt([spread / half.size + a.rounding**2 for half in halves])
+    means = np.array([four.mean(axis=1) for four in each])
+    return np.array([a.signals.t[half].mean() for half in halves]), means, errors
+
+
+def zero_drift(a: WeighedTrial, free_steps: Sequence[int]) -> np.ndarray:
+    """Steady drift (4,) of the forces' zeros within a trial [N/s], 0 where free motion shows no line."""
+    t, means, errors = _zeros(a, free_steps)
     out = np.zeros(len(FORCE_CHANNELS))
-    spans = [np.asarray(a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0) for k in free_steps]
-    for i, name in enumerate(FORCE_CHANNELS):
-        force = getattr(a.signals, name)
-        pieces = [force[span & np.isfinite(force)] for span in spans]
-        pieces = [piece for piece in pieces if piece.size >= MIN_FREE]
-        if len(pieces) < 2:
-            continue
-        middles = np.array([np.median(piece) for piece in pieces])
-        errors = np.sqrt(np.array([variance[i] / piece.size for piece in pieces]))
-        allowed = SURE * np.hypot(errors.max() + errors, rig.systematic.force_bias[i])
-        off = np.abs(middles - middles.mean())
-        if (off > allowed).any() and off.max() > ZERO_SHARE * float(np.nanmax(np.abs(force))):
-            out[i] = off.max()
+    for i in range(len(out) if len(t) > 2 else 0):
+        line, variance = np.polyfit(t, means[:, i], 1, w=1 / errors[:, i], cov="unscaled")
+        straight = np.abs(means[:, i] - np.polyval(line, t)) < SURE * errors[:, i]
+        out[i] = line[0] if straight.all() and abs(line[0]) > SURE * np.sqrt(variance[0, 0]) else 0.0
     return out
+
+
+def without_drift(one: TrialAlignment, drift: np.ndarray) -> TrialAlignment:
+    """The trial less a drift (4,) of its forces' zeros [N/s]."""
+    since = one.trial.t - one.trial.t.mean()
+    ours = {f: one.trial.channels[f] - since * d for f, d in zip(FORCE_CHANNELS, drift, strict=True)}
+    trial = replace(one.trial, channels=one.trial.channels | ours)
+    return replace(one, trial=trial, signals=replace(one.signals, **ours))
+
+
+def _moved_zero(a: WeighedTrial, free_steps: Sequence[int], rig: Rig) -> np.ndarray:
+    """Largest deviation (4,) [N] of forces in half a free stretch from the mean of all; 0 if due to noise."""
+    _, means, errors = _zeros(a, free_steps)
+    allowed = SURE * np.hypot(errors.max(axis=0) + errors, rig.systematic.force_bias)
+    off = np.abs(means - means.mean(axis=0))
+    return np.where((off > allowed).any(axis=0), off.max(axis=0), 0.0)
 
 
 def level_rises(raw: np.ndarray, rises: dict[int, Terms]) -> dict[int, float]:
@@ -453,8 +476,8 @@ class Design:
     slopes and that of each. `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4,
     N): forces in free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force
     biases that free motion shows and the rig does not admit; `doubts`: the same for the pads; `level_rises`:
-    mean recorded rise by move between equal heights [m]; `moved` (4,): drift of the forces' zeros within a
-    trial [N].
+    mean recorded rise by move between equal heights [m]; `moved` (4,): how far the forces' zeros move within
+    a trial [N].
     """
 
     unknowns: tuple[Unknown, ...]

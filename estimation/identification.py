@@ -20,13 +20,13 @@ from estimation.checks import (
     unstated_pads,
 )
 from estimation.consistency import contradictions, force_scale
-from estimation.design import Design, Unknown, build
+from estimation.design import Design, Unknown, build, without_drift, zero_drift
 from estimation.friction import FrictionPosterior, friction_posteriors
 from estimation.observations import Noise, WeighedTrial, aligned_weights
 from estimation.posterior import posterior
 from estimation.report import Actual, inference_data, properties_table, summary
 from estimation.sampler import Draws, sample
-from hmmseg.contact.decompose import UNITS, Decomposition, decompose
+from hmmseg.contact.decompose import FREE, UNITS, Decomposition, decompose
 from hmmseg.errors import nearest
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
@@ -172,6 +172,11 @@ def identify_aligned(
     """Properties of every block from aligned trials, pooled; `progress(steps_done, steps_at_most)`."""
     rng, rig, task = np.random.default_rng(seed), aligned.rig, aligned.task
     weighed, noise = aligned_weights(aligned, rng)
+    free = [step.index for step in aligned.subtasks if step.state == FREE]
+    drift, recorded = np.array([zero_drift(a, free) for a in weighed]), aligned
+    if drift.any():
+        aligned = replace(aligned, trials=tuple(map(without_drift, aligned.trials, drift)))
+        weighed, noise = aligned_weights(aligned, rng)
     design = build(aligned, weighed, noise)
     post = posterior(design) if design.unknowns else None
     sampled = None if post is None else sample(post, seed, progress)
@@ -209,17 +214,17 @@ def identify_aligned(
         f"{n.name}: forces in free motion are not zero as the rig has it; a bias is estimated with the rest"
         for n in design.unexpected
     ]
-    warnings += [
-        f"the zero of {name} moves by {size:.2g} N between stretches of free motion; intervals allow for it"
-        for name, size in zip(FORCE_CHANNELS, design.moved, strict=True) if size > 0
-    ]  # fmt: skip
+    drifts = "drifts by {:.2g} N/s, which is removed", np.abs(drift).max(axis=0)
+    moves = "moves by {:.2g} N between stretches of free motion; intervals allow for it", design.moved
+    warnings += [f"the zero of {name} {text.format(size)}" for text, sizes in (drifts, moves)
+                 for name, size in zip(FORCE_CHANNELS, sizes, strict=True) if size > 0]  # fmt: skip
     warnings += dict.fromkeys(contradicted.values())
     warnings += [*soft_pads(design, rig), *unnamed(task, design), *dense(task, rig, means)]
     friction = {
         k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
     }
     return Identification(
-        task, rig, aligned, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
+        task, rig, recorded, tuple(weighed), noise, tuple(u.name for u in unknowns[:num]),
         draws[:, :num], unknowns[num:], draws[:, num:], sampled if kept else None, friction, reasons,
         predictive, tuple(warnings), tuple(notes), centres | means,
     )  # fmt: skip

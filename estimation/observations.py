@@ -26,7 +26,7 @@ from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.levels import TAIL
-from hmmseg.robust import median_of_known, robust_sd
+from hmmseg.robust import coarse_step, median_of_known, robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.emissions import acceleration, thin
 from hmmseg.tables import Brief
@@ -211,7 +211,7 @@ class WeighedTrial(Brief):
     (num_alignments,); `free`: weights (num_timesteps,) over free motion, of `free_count` samples;
     `free_robust` (4, num_timesteps): those of each force, robust to a finger that touches early. `slopes[m]`
     maps "distance" and "rise" to slopes over the pads' give within the grip, and "landing" to that of heights
-    from the touch to the place, where seen.
+    from the touch to the place, where seen. `rounding` (4,): error of each force that no average removes [N].
     """
 
     signals: Signals
@@ -222,6 +222,7 @@ class WeighedTrial(Brief):
     free_robust: np.ndarray
     free_count: float
     slopes: dict[int, dict[str, Slope]] = field(default_factory=dict)
+    rounding: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
 
 def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[list[WeighedTrial], Noise]:
@@ -279,7 +280,8 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
             scales[name] = max(scales.get(name, 0.0), scale)
             pooled[name].append((residual[free], weight[free]))
         shares, count = free / max(free.sum(), 1), float(free.sum())
-        weighed.append(WeighedTrial(thinned, masks, grips, counts, shares, robust, count, slopes))
+        rounding = np.array([coarse_step(getattr(trial.signals, n)) for n in FORCE_CHANNELS]) / np.sqrt(12)
+        weighed.append(WeighedTrial(thinned, masks, grips, counts, shares, robust, count, slopes, rounding))
     return weighed, estimated_noise(pooled, scales, channel_sds([w.signals for w in weighed], aligned))
 
 

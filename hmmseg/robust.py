@@ -24,10 +24,15 @@ def white_sd(values: np.ndarray, order: int = 2) -> float:
 
 
 def coarse_step(values: np.ndarray) -> float:
-    """Step between the readings of a channel if it is coarser than their noise, else 0."""
+    """Step between the readings of a channel if it is coarser than their noise, else 0.
+
+    Noise of half a step repeats a reading as often as it moves it by one or two; faster motion tells nothing.
+    """
     there = values[np.isfinite(values)]
     step = float(np.diff(np.unique(np.round(there, 9))).min(initial=np.inf)) if there.size > 1 else np.inf
-    return step if step < np.inf and white_sd(there, 1) < step / 2 else 0.0
+    moved = np.abs(np.diff(there)) / step
+    still, near = (moved < 0.5).sum(), (moved < 2.5).sum()
+    return step if still > near / 2 + np.sqrt(near) else 0.0  # by two sds of a fair chance
 
 
 def runs(found: np.ndarray) -> list[tuple[int, int]]:

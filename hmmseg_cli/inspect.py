@@ -98,7 +98,8 @@ def _show(out: Output, found: Inspection) -> None:
                 "which (hmmseg new lays it out), or a task of named states takes the columns as they are:\n"
                 f'sequence = ["...", "..."] in task.toml, then: {segment}')  # fmt: skip
     else:
-        text = f"{found.file}: all columns understood; next: {segment} --rig rig.toml"
+        then = f"next: {segment} --rig rig.toml" if found.rate else "the times are not"
+        text = f"{found.file}: all columns understood; {then}"
     out.print(text, whole=True)
 
 

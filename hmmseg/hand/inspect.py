@@ -27,6 +27,7 @@ from hmmseg.io.trial import (
     CARTESIAN_CHANNELS,
     CARTESIAN_OPTIONAL,
     JOINT_CHANNELS,
+    MIN_SAMPLES,
     Trial,
     mapped_times,
     trial_of,
@@ -97,7 +98,8 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
     toml = as_toml(entries, table) if entries else ""
     if set(entries) <= {"t"} and not already and (rig is None or rig.gripper is None):
         toml = propose_gripper(table, entries) or toml
-    t, origin = _clock(table, entries, rig)
+    t, origin, refused = _clock(table, entries, rig)
+    remarks += refused
     channels = tuple(_channel(table, name, t) for name in table.names if name in table.columns)
     start, end, rate, gaps = None, None, None, ()
     if t is not None:
@@ -106,7 +108,7 @@ def inspect(path: str | Path, rig: Rig | None = None) -> Inspection:
         gaps = tuple((float(t[i]), float(t[i + 1])) for i in np.flatnonzero(np.diff(t) > GAP * period))
     return Inspection(
         str(path), tuple(parts), int(table.rows.size), start, end, rate, origin, gaps, channels, entries,
-        toml, tuple(remarks), not toml and _understood(table, rig),
+        toml, tuple(remarks), not toml and _understood(table, None if refused else rig),
     )  # fmt: skip
 
 
@@ -121,15 +123,16 @@ def _understood(table: Table, rig: Rig | None) -> bool:
 
 
 def _clock(table: Table, entries: dict[str, dict[str, Any]], rig: Rig | None
-           ) -> tuple[np.ndarray | None, int | None]:  # fmt: skip
-    """Times [s] by the proposal or the rig; None if the file has none that can be used."""
+           ) -> tuple[np.ndarray | None, int | None, list[str]]:  # fmt: skip
+    """Times [s] by the proposal or the rig, None if the file has none that can be used, and why not."""
     rig = rig or Rig()
     if "t" in entries:
         rig = rig.model_copy(update={"columns": {**rig.columns, "t": Column.model_validate(entries["t"])}})
     try:
-        return mapped_times(table, rig)
-    except InputError:
-        return None, None
+        return *mapped_times(table, rig), []
+    except InputError as error:
+        there = "t" in {*table.names, *rig.columns} and table.rows.size >= MIN_SAMPLES
+        return None, None, [str(error)] if there else []
 
 
 def _channel(table: Table, name: str, t: np.ndarray | None) -> Channel:

@@ -236,11 +236,11 @@ def _find_repeats(name: str, t: np.ndarray, seen: dict[str, np.ndarray], fellows
     stuck = np.zeros(values.size, bool)
     standing: dict[float, list[tuple[float, float]]] = {}
     other = seen.get(name.translate(str.maketrans("12", "21")) if name[0] == "f" else "")
-    each, number = np.unique(shown, return_counts=True)
-    moving = shown[shown != each[number.argmax()]]  # a stuck sensor's one value is no step
+    repeats = sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]
+    moving = np.delete(shown, slice(*repeats[0]) if repeats else [])  # a stuck sensor's one value is no step
     rounded = name not in FORCE_CHANNELS and coarse_step(moving) > 0  # and repeats itself at rest
     least = _share_of_repeats([seen[f] for f in fellows if f != name], shown.size)  # quick, for most runs
-    for start, stop in sorted(runs(np.diff(shown) == 0), key=lambda run: run[0] - run[1])[:MOST]:
+    for start, stop in repeats:
         value, at = float(shown[start]), there[start : stop + 1]
         # If the other finger's force is exactly zero as well, the sensors suppress small readings.
         if stop - start < 2 or (value == 0 and other is not None and np.mean(other[at] == 0) > 0.5):

@@ -48,6 +48,7 @@ READING = np.dtype([
     ("t", "f8"), ("force", "f8", 4), ("vx", "f8"), ("vy", "f8"), ("ay", "f8"), ("y", "f8"), ("d", "f8"),
     ("sd_y", "f8"), ("sd_d", "f8"), ("sd_vx", "f8"), ("sd_vy", "f8"),
     ("last_y", "f8"), ("last_d", "f8"), ("last_fy", "f8"),  # previous reading's; net fy 1 / MAX_RATE s before
+    ("last_force", "f8", 4),  # the last ones that were read
     ("sd_fx", "f8"), ("sd_fy", "f8"),  # error of net forces from the tool on a wrist's sensor
     ("gripped", "f8"),  # known apart from forces: 0: nothing is held, 2: something is; 1: unknown
 ])  # fmt: skip
@@ -103,6 +104,8 @@ def read(rows, head, filled, t, dt, channels, jointed, geometry, measured, befor
         number += 1
     for k in range(4):
         x.force[k] = _mean(rows, head, number, k)
+        if not math.isnan(x.force[k]):
+            x.last_force[k] = x.force[k]
     x.vx, x.vy = _mean(rows, head, number, 4), _mean(rows, head, number, 5)
     x.y, x.d = _mean(rows, head, number, 6), _mean(rows, head, number, 7)
     here.fy = x.force[1] + x.force[3]
@@ -217,19 +220,24 @@ def _carry(h, x):
 
 
 @compiled
+def _shown(h, x, c, sign):
+    """A force without its bias [N]; one missing is the other finger's times `sign`, both are as last seen."""
+    if not math.isnan(x.force[c]):
+        return _force(h, x, c)
+    other = sign * _force(h, x, (c + 2) % 4)
+    return x.last_force[c] - h.bias[c, 0] / h.bias[c, 1] if math.isnan(other) else other
+
+
+@compiled
 def _held_width(h, x, pads):
-    """Width of the held block [m]; a missing force is the other finger's, without both pads are rigid."""
-    fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
-    width = block_width(x.d, -fx2 if math.isnan(fx1) else fx1, -fx1 if math.isnan(fx2) else fx2, pads)
-    return x.d if math.isnan(width) else width
+    """Width of the held block [m]."""
+    return block_width(x.d, _shown(h, x, 0, -1.0), _shown(h, x, 2, -1.0), pads)
 
 
 @compiled
 def _held_height(h, x, pads):
-    """Height of the held block [m]; with missing forces as for its width."""
-    fy1, fy2 = _force(h, x, 1), _force(h, x, 3)
-    height = block_y(x.y, fy2 if math.isnan(fy1) else fy1, fy1 if math.isnan(fy2) else fy2, pads)
-    return x.y if math.isnan(height) else height
+    """Height of the held block [m]."""
+    return block_y(x.y, _shown(h, x, 1, 1.0), _shown(h, x, 3, 1.0), pads)
 
 
 @compiled

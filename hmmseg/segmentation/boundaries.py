@@ -222,7 +222,7 @@ def crossing_density(crossings: list[Crossing], width: float, first: bool = Fals
     """Density (POINTS,), summing to 1, of the time in an interval of `width` s at which all have crossed.
 
     With several crossings (two fingers that touch) the boundary is the last of them, or if stated the
-    `first`; without any the density is uniform.
+    `first`; without any the density is uniform. Unseen for long, motions may begin and end otherwise.
     """
     if not crossings:
         return np.full(POINTS, 1.0 / POINTS)
@@ -233,7 +233,8 @@ def crossing_density(crossings: list[Crossing], width: float, first: bool = Fals
     else:
         crossed = np.prod([_crossed(c, width) for c in crossings], axis=0)
     density = np.diff(crossed, prepend=0.0)
-    return (1 - UNIFORM) * density / density.sum() + UNIFORM / POINTS
+    anywhere = 1 - (1 - UNIFORM) * np.exp(-max(width - MOTION[0], 0.0) / MOTION[1])
+    return (1 - anywhere) * density / density.sum() + anywhere / POINTS
 
 
 def _crossed(c: Crossing, h: float) -> np.ndarray:

@@ -19,7 +19,6 @@ docs/segmentation.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -32,7 +31,7 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.hand.signals import Signals, central_differences, group_size, grouped
 from hmmseg.io.rig import Rig
 from hmmseg.levels import MOVED
-from hmmseg.robust import extent, median_of_known, white_sd
+from hmmseg.robust import coarse_step, extent, filled, median_of_known, runs, white_sd
 from hmmseg.tables import Brief
 
 STRAY = 0.02  # prior: share of resting samples that move briefly (a grip settling, a bounce)
@@ -75,11 +74,11 @@ class Features(Brief):
         return (self.force[:, 0] - self.force[:, 2]) / 2
 
     def block_width(self, bias: np.ndarray) -> np.ndarray:
-        """Width of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        """Width of the held block (num_timesteps,) [m]; forces are bridged where both are missing."""
         return block_width(self.d, *_pair(self.force - bias, 0, 2, -1.0), self.pads)
 
     def block_y(self, bias: np.ndarray) -> np.ndarray:
-        """Height of the held block (num_timesteps,) [m]; with rigid pads where both forces are missing."""
+        """Height of the held block (num_timesteps,) [m]; forces are bridged where both are missing."""
         return block_y(self.y, *_pair(self.force - bias, 1, 3, 1.0), self.pads)
 
     @cached_property
@@ -88,27 +87,25 @@ class Features(Brief):
         return {"d": float(np.median(self.sd_d)), "y": float(np.median(self.sd_y))}
 
     @cached_property
-    def resolution(self) -> float:
-        """Standard deviation [N] of what rounding of the forces to a step adds; about 0 without one.
-
-        Nearly all small changes between readings are one step then, so that most readings of a free finger
-        are the same, and no scale can be learned from them.
-        """
-        change = np.abs(np.diff(self.force, axis=0))
-        change = change[change > 0]
-        return float(np.quantile(change, 0.1)) / math.sqrt(12) if change.size else 0.0
-
-    @cached_property
     def carrying(self) -> np.ndarray:
         """Net vertical force on a lifted block, in units of its weight (num_timesteps,)."""
         return carried_force(1.0, np.nan_to_num(self.ay), self.gravity)
 
 
 def _pair(force: np.ndarray, first: int, second: int, sign: float) -> tuple[np.ndarray, np.ndarray]:
-    """Forces of both fingers (num_timesteps,): a missing one is the other times `sign`, 0 without both."""
+    """Forces of both fingers (num_timesteps,): one missing is the other times `sign`, both are bridged."""
     pair = force[:, first], force[:, second]
     a, b = (np.where(np.isnan(own), sign * other, own) for own, other in (pair, pair[::-1]))
-    return np.nan_to_num(a), np.nan_to_num(b)
+    return filled(a), filled(b)
+
+
+def _unseen(force: np.ndarray, first: int, second: int, sign: float) -> np.ndarray:
+    """Error (num_timesteps,) [N] of forces bridged where both are missing: half of the change meanwhile."""
+    one, other = force[:, first], sign * force[:, second]
+    shown, out = np.where(np.isnan(one), other, one), np.zeros(one.size)
+    for start, stop in runs(np.isnan(shown)):
+        out[start:stop] = np.ptp(shown[[max(start - 1, 0), min(stop, shown.size - 1)]]) / 2
+    return np.nan_to_num(out)
 
 
 @dataclass(frozen=True)
@@ -278,9 +275,9 @@ WINDOW = 6e-3  # chosen: s over which a reading is averaged; contacts change no 
 
 
 def noise_sd(values: np.ndarray) -> float:
-    """Robust standard deviation of white sample noise; NaN for fewer than three samples."""
+    """Robust standard deviation of white sample noise, and of rounding; NaN for fewer than three samples."""
     finite = values[np.isfinite(values)]
-    return float(white_sd(finite)) if finite.size > 2 else np.nan
+    return max(float(white_sd(finite)), coarse_step(finite) / np.sqrt(12)) if finite.size > 2 else np.nan
 
 
 def channel_sd(stated: np.ndarray, values: np.ndarray) -> float:
@@ -335,11 +332,13 @@ def features(signals: Signals, rig: Rig) -> Features:
         "force": 1.5 * float(np.nanmax(np.abs(force))) + 1e-3,
         "press": 1.5 * float(np.max(np.abs(s.fy), initial=0.0, where=np.isfinite(s.fy))) + 1e-3,
     }
+    pads = pads_of(rig)
+    sd_d = np.hypot(2 * stated(s.sd_x, s.distance / 2), _unseen(force, 0, 2, -1.0) * 2 * pads.normal1)
     return Features(
-        t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y,
-        d=s.distance, sd_y=stated(s.sd_y, s.y), sd_d=2 * stated(s.sd_x, s.distance / 2),
+        t=s.t, force=force, vx=s.vx, vy=s.vy, ay=acceleration(s.t, s.vy), y=s.y, d=s.distance,
+        sd_y=np.hypot(stated(s.sd_y, s.y), _unseen(force, 1, 3, 1.0) * pads.shear1), sd_d=sd_d,
         sd_vx=stated(s.sd_vx, s.vx), sd_vy=stated(s.sd_vy, s.vy),
-        pads=pads_of(rig), gravity=rig.gravity, span=span, free=s.free,
+        pads=pads, gravity=rig.gravity, span=span, free=s.free,
     )  # fmt: skip
 
 

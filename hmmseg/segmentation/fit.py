@@ -16,7 +16,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Sub
 from hmmseg.hmm import Chain, em
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import TAIL
-from hmmseg.robust import NORMAL, weighted_median
+from hmmseg.robust import NORMAL, coarse_step, weighted_median
 from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
 from hmmseg.tables import Brief
 
@@ -64,8 +64,9 @@ def initial_parameters(features: Sequence[Features], subtasks: tuple[Subtask, ..
 
 
 def _least_force(features: Sequence[Features]) -> float:
-    """Least noise [N] of a force: what rounding adds, in the median trial."""
-    return max(float(np.median([f.resolution for f in features])), 1e-6)
+    """Least noise [N] of a force: what rounding to steps adds, in the median trial."""
+    steps = [max(coarse_step(force) for force in f.force.T) for f in features]
+    return max(float(np.median(steps)) / np.sqrt(12), 1e-6)
 
 
 def chain_of(shares: np.ndarray, length: int) -> Chain:

@@ -70,16 +70,24 @@ class Contacts:
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool) -> Penetration:
-        """Penetration of finger i past the face of the block, which is midway between both estimates."""
-        inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
-        face = median_of_known(inward[held] - self.compression[i, held])
+        """Penetration of finger i past the face of the block, which is midway between both estimates.
+
+        A block that the other finger already pushes is nearer by what that one's pad gives.
+        """
+        place, rate, sd = self.inward.mean(axis=0), self.inward_rate.mean(axis=1), self.sd["compression"]
+        own, other = self.compression[i], self.compression[1 - i]
+        other = np.where(np.isnan(other), own, other) if making else own
+        place = place - median_of_known((place - (own + other) / 2)[held])
+        sd_place, sd_rate = self.sd["inward"], self.sd["inward_rate"]
+        if making:
+            other = np.where(np.isnan(self.compression[1 - i]), place, np.maximum(other, 0.0))
+            place, rate = 2 * place - other, 2 * rate - one_sided(self.signals.t, other)[0]
+            sd_place, sd_rate = np.sqrt(2) * sd_place, np.sqrt(2) * sd_rate
         # An error of the pad's stiffness shifts the face.
-        pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
-        sd_inward = float(np.hypot(self.sd["inward"], self.sensing.normal.doubt * pressed))
-        sd = self.sd["compression"]
+        pressed = np.nan_to_num(median_of_known(own[held]))
         return self._timely(Penetration(
-            self.signals.t, self.compression[i], inward - face, rate, sd, sd,
-            sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
+            self.signals.t, own, place, rate, sd, sd,
+            float(np.hypot(sd_place, self.sensing.normal.doubt * pressed)), sd_rate, self.sensing.normal.form,
             self.sensing.normal.value + self.sensing.normal.toe.slope < RIGID,
         ), making)  # fmt: skip
 
@@ -204,7 +212,8 @@ def contact_changes(
         probability = posterior.moves[0][:, k]
         prior = Prior(t, probability, (edges[k], edges[k + 2]))
         n = int(probability.argmax())
-        out.append(table.change(steps[k], steps[k + 1], prior, _held_side(t, path, steps, k, n)))
+        held = _held_side(reading.features, path, steps, k, n)
+        out.append(table.change(steps[k], steps[k + 1], prior, held))
     return out
 
 
@@ -234,14 +243,19 @@ def nearest_touch(touches: Touches, boundary: BoundaryPosterior) -> BoundaryPost
 
 
 def _held_side(
-    t: np.ndarray, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
+    f: Features, path: np.ndarray, steps: tuple[Subtask, ...], k: int, n: int
 ) -> tuple[float, float]:
-    """Nearest stretch [s] to interval n of the subtask that rests on the ground, before or after it."""
+    """Nearest stretch [s] to interval n, with forces if there are any, of the subtask that rests on the
+    ground, before or after it."""
+    t = f.t
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
+    read = [i for i in own if np.isfinite(f.force[i]).all()]
     if after:
-        return t[n + 1], min(t[n + 1] + DRIFTS, max(t[own[-1]] if own.size else 0.0, t[n + 1]))
-    return max(t[n] - DRIFTS, min(t[own[0]] if own.size else np.inf, t[n])), t[n]
+        first = t[min((i for i in read if i > n), default=n + 1)]
+        return first, min(first + DRIFTS, max(t[own[-1]] if own.size else 0.0, first))
+    last = t[max((i for i in read if i <= n), default=n)]
+    return max(last - DRIFTS, min(t[own[0]] if own.size else np.inf, last)), last
 
 
 def to_spans(

@@ -81,6 +81,7 @@ ALTERED = {
     "saturated": (clipped(2.0, *FORCES), "fx1 goes no farther than 2: it saturates"),
     "lost counts": (later(0.7, 0.2, "q21"), "q21 jumps by 0.19.* at 7.00 s"),
     "moved zero": (later(0.5, 1.0, "fx2"), "the zero of fx2 moves"),
+    "drifting zero": (lambda c: {"fy1": c["fy1"] + 0.01 * c["t"]}, "the zero of fy1 drifts by 0.01 N/s"),
     "twice": (scaled(2.0, *FORCES), "forces are read 1.8 times too large"),
     "ten times": (scaled(10.0, *FORCES), "forces are read 8.* times too large"),
     "half": (scaled(0.5, *FORCES), "forces are read 2 times too small"),
@@ -96,8 +97,8 @@ ALTERED = {
 }  # fmt: skip
 
 
-QUICK = ("frozen force", "constant", "frozen encoder", "wild cell", "saturated", "twice", "one finger",
-         "one vertical", "clock")  # fmt: skip
+QUICK = ("frozen force", "constant", "frozen encoder", "wild cell", "saturated", "drifting zero", "twice",
+         "one finger", "one vertical", "clock")  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -120,6 +121,14 @@ def assert_no_number_misleads(found, named):
                 assert low <= props[prop] <= high, (obj, prop, low, high)
             else:
                 assert found.reasons[f"{obj}.{prop}"]
+
+
+def test_forces_in_steps_coarser_than_their_noise_are_known_no_better():
+    rounded = {name: 0.25 * np.round(TABLE[name] / 0.25) for name in FORCES}
+    found = identify(TABLE | rounded, FOLDER / "task.toml", FOLDER / "rig.toml")
+    for obj, props in TRUTH.items():
+        low, high = np.quantile(found.of(obj, "weight"), [0.01, 0.99])
+        assert low <= props["weight"] <= high, (obj, low, high)
 
 
 def hand(wider=0.0, higher=0.0, **links):

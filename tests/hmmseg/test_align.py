@@ -10,7 +10,7 @@ import pytest
 
 from experiments.recordings import read_case
 from experiments.worlds import Cell, World, scene, simulated_cases, trials_of
-from hmmseg.io.rig import Fingertip, Noise, Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Fingertip, Noise, Rig
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align, segment
 
@@ -89,6 +89,15 @@ def test_missing_samples_and_irregular_times(change):
     trials, truth, task, rig = simulated(50.0)
     found = residuals([change(t, np.random.default_rng(0)) for t in trials], truth, task, rig)
     assert np.abs(found).max() < NEAR
+
+
+@pytest.mark.parametrize("start", [-0.2, 0.1])
+def test_forces_missing_for_half_a_second_leave_changes_to_positions(start):
+    (trial,), truth, task, rig = simulated(100.0)
+    since = trial.t[:, None] - truth[0][::3] - start  # of a touch, a release and a set-down
+    lost = ((since > 0) & (since < 0.5)).any(axis=1)
+    channels = trial.channels | {f: np.where(lost, np.nan, trial.channels[f]) for f in FORCE_CHANNELS}
+    assert np.abs(residuals([replace(trial, channels=channels)], truth, task, rig)).max() < NEAR
 
 
 @pytest.mark.parametrize("block", ["block1", "block2"])

@@ -16,7 +16,16 @@ from hmmseg.io.task import BlockTask, Move
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.emissions import RUNG, Features, Parameters, _log_ungripped, log_likelihoods
-from hmmseg.segmentation.fit import _location, _scale, chain_of, fit, initial_parameters, mean_shares, otsu
+from hmmseg.segmentation.fit import (
+    _least_force,
+    _location,
+    _scale,
+    chain_of,
+    fit,
+    initial_parameters,
+    mean_shares,
+    otsu,
+)
 
 STACK = BlockTask(
     {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))
@@ -282,11 +291,11 @@ def test_a_scale_is_not_learned_from_readings_that_rounding_makes_equal():
     step = 5 * PLANTED.noise
     rounded = replace(trial, force=step * np.round(trial.force / step))
     assert np.mean(rounded.force[labels == 0] == 0) > 0.9
-    assert rounded.resolution == pytest.approx(step / np.sqrt(12))
+    assert _least_force([rounded]) == pytest.approx(step / np.sqrt(12))
     found = fit([rounded], STEPS)
     assert found.parameters.scale["force"] == pytest.approx(step / np.sqrt(12))
     assert np.mean(np.asarray(found.posteriors[0].path) == labels) > 0.95
-    assert trial.resolution < 0.3 * PLANTED.noise
+    assert _least_force([trial]) < 0.3 * PLANTED.noise
 
 
 def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():

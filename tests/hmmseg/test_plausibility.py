@@ -16,6 +16,8 @@ from experiments.wrist_scene import TASK, Setup, performances, wrist_recording, 
 from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig, read_rig
+from hmmseg.robust import coarse_step
+from hmmseg.segmentation.emissions import noise_sd
 
 
 def changed(table, **factors):
@@ -128,6 +130,14 @@ def test_positions_in_coarse_steps_are_told_and_not_taken_for_stuck():
     )
     assert not any(re.match(r".*: [xy]\d repeats", line) for line in trial.warnings)
     assert read_trial(CARTESIAN, FREE).step == (0, 0)
+
+
+def test_steps_of_a_channel_that_moves_more_often_than_it_rests():
+    rng, place = np.random.default_rng(0), np.abs(np.linspace(-0.3, 0.3, 1500)).clip(0.1)
+    read = place + rng.normal(0, 2e-5, place.size)
+    assert coarse_step(read) == coarse_step(np.round(read, 5)) == 0
+    assert coarse_step(np.round(read, 4)) == pytest.approx(1e-4)
+    assert noise_sd(np.round(read, 4)) >= 1e-4 / np.sqrt(12) * 0.999
 
 
 @pytest.mark.parametrize("name", ["x2", "y1"])

@@ -76,8 +76,8 @@ def test_emissions_are_those_off_line():
     span = np.array([tuple(f.span[name] for name in RANGES.names)], RANGES)[0]
     for n in range(0, f.t.size, 3):
         x = np.array([(f.t[n], f.force[n], f.vx[n], f.vy[n], f.ay[n], f.y[n], f.d[n], f.sd_y[n], f.sd_d[n],
-                       f.sd_vx[n], f.sd_vy[n], f.y[n - 1] if n else np.nan, np.nan, np.nan, 0.0, 0.0,
-                       1.0)], READING)[0]  # fmt: skip
+                       f.sd_vx[n], f.sd_vy[n], f.y[n - 1] if n else np.nan, np.nan, np.nan,
+                       f.force[n], 0.0, 0.0, 1.0)], READING)[0]  # fmt: skip
         for step in steps[:4]:
             if step.state == FREE:
                 found, halt = one.free(h, x, span), one.STILL
@@ -229,12 +229,14 @@ def test_a_missing_force_is_taken_to_be_the_other_fingers(name, measure):
     assert np.median(np.abs(without - whole)) < 5e-5 < np.quantile(np.abs(trial.channels[name]), 0.9) / 2500
 
 
-def test_a_block_is_not_dropped_where_one_finger_is_not_read():
-    """The other presses as hard: a distance without the pads' give would be that of another block."""
+@pytest.mark.parametrize("names", [("fx1", "fy1"), ("fx1", "fy1", "fx2", "fy2")])
+def test_a_block_is_not_dropped_where_forces_are_not_read(names):
+    """The other finger presses as hard, or both as before: a distance without the pads' give would be that of
+    another block."""
     watcher, t, table = read(NONE / "trial_01.csv", NONE / "rig.toml")
     lifted, landed = json.loads((NONE / "truth" / "trial_01.json").read_text())["boundaries"][1:3]
     gone = (t > lifted + 0.3) & (t < lifted + 0.8 * (landed - lifted))
-    columns = [watcher.channels.index(name) for name in ("fx1", "fy1")]
+    columns = [watcher.channels.index(name) for name in names]
     table[np.ix_(gone, columns)] = np.nan
     lines = follow(watcher, t, table)
     assert all(line["fits"] for line in lines)

@@ -50,6 +50,14 @@ OTHERS = {
 }  # fmt: skip
 
 
+def test_times_that_are_refused_are_told_and_lead_nowhere(tmp_path, capsys):
+    frame = pd.DataFrame(CARTESIAN)
+    pd.concat([frame, frame]).to_csv(tmp_path / "two.csv", index=False)
+    assert main(["inspect", str(tmp_path / "two.csv")]) == 0
+    said = capsys.readouterr()
+    assert "column t: 0 after" in said.err and "the times are not" in said.out and "next:" not in said.out
+
+
 def test_another_labs_file_is_read_with_what_inspect_proposes(tmp_path, capsys):
     """Foreign names, units partly told, finger 2's forces with the other sign, times in ns."""
     ours = dict(CARTESIAN)
