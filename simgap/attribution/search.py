@@ -96,7 +96,7 @@ def _linearised(f: Forms, effects: Sequence[int]) -> tuple[int, ...]:
     for j in effects:
         rest = {of[i].name for i in effects} - {of[j].name}
         same = [j, *(i for i, c in enumerate(of) if c.form_of == of[j].form_of)]
-        out.append(min(same, key=lambda i: (len({*of[i].beside} ^ rest), -i)))
+        out.append(min(same, key=lambda i: (len({*of[i].beside} ^ rest), len({*of[i].beside} - rest), -i)))
     return tuple(sorted(out))
 
 
