@@ -230,8 +230,7 @@ def moment(change: Change, discrepancy: float = DISCREPANCY) -> BoundaryPosterio
     fingers have opened as far as the pads were compressed: a pad that slides comes off and meets the block
     again for some ms. Where these differ, the posterior is their mixture (VIEWS).
 
-    The later of two touches comes when the fingers are the block's width apart, less what the pad of the
-    first gives, which pushes the block.
+    The later of two touches comes when the fingers are the block's width apart: the first pushes the block.
     """
     contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, discrepancy))) for c in change.contacts]
     views, weight = [contacts], (1.0,)

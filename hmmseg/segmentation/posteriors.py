@@ -70,24 +70,16 @@ class Contacts:
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool) -> Penetration:
-        """Penetration of finger i past the face of the block, which is midway between both estimates.
-
-        A block that the other finger already pushes is nearer by what that one's pad gives.
-        """
-        place, rate, sd = self.inward.mean(axis=0), self.inward_rate.mean(axis=1), self.sd["compression"]
-        own, other = self.compression[i], self.compression[1 - i]
-        other = np.where(np.isnan(other), own, other) if making else own
-        place = place - median_of_known((place - (own + other) / 2)[held])
-        sd_place, sd_rate = self.sd["inward"], self.sd["inward_rate"]
-        if making:
-            other = np.where(np.isnan(self.compression[1 - i]), place, np.maximum(other, 0.0))
-            place, rate = 2 * place - other, 2 * rate - one_sided(self.signals.t, other)[0]
-            sd_place, sd_rate = np.sqrt(2) * sd_place, np.sqrt(2) * sd_rate
+        """Penetration of finger i past the face of the block, which is midway between both estimates."""
+        inward, rate = self.inward.mean(axis=0), self.inward_rate.mean(axis=1)
+        face = median_of_known(inward[held] - self.compression[i, held])
         # An error of the pad's stiffness shifts the face.
-        pressed = np.nan_to_num(median_of_known(own[held]))
+        pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
+        sd_inward = float(np.hypot(self.sd["inward"], self.sensing.normal.doubt * pressed))
+        sd = self.sd["compression"]
         return self._timely(Penetration(
-            self.signals.t, own, place, rate, sd, sd,
-            float(np.hypot(sd_place, self.sensing.normal.doubt * pressed)), sd_rate, self.sensing.normal.form,
+            self.signals.t, self.compression[i], inward - face, rate, sd, sd,
+            sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
             self.sensing.normal.value + self.sensing.normal.toe.slope < RIGID,
         ), making)  # fmt: skip
 

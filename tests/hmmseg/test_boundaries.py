@@ -354,23 +354,3 @@ def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():
     load = table._load(aligned.subtasks[1], np.ones(n, bool), making=False)
     np.testing.assert_allclose(load.pressed, load.pressed[0], rtol=1e-9)
     assert load.hidden and load.pressed[0] > 0
-
-
-def test_the_later_finger_meets_a_pushed_block_by_what_the_pad_of_the_first_gives():
-    folder, t, give = example_folder(), np.arange(300) / 100, 1.5e-4  # m that the first finger presses with
-    rig = Rig.read(folder / "rig.toml")
-    aligned = align(folder / "trial_01.csv", folder / "task.toml", rig)
-    squeeze = np.minimum(0.05 * (t - 1.503), 1e-3)  # beyond the width: the second touches 3 ms after `give`
-    first = np.where(squeeze > give, (squeeze + give) / 2, np.clip(squeeze + 0.01, 0.0, give))
-    second = np.where(squeeze > give, (squeeze - give) / 2, 0.0)
-    old = aligned.trials[0].signals
-    made = {name: np.zeros(t.size) for name, v in vars(old).items() if isinstance(v, np.ndarray)}
-    made |= {"t": t, "x1": squeeze / 2, "x2": 0.03 - squeeze / 2, "fx1": 4e3 * first, "fx2": -4e3 * second}
-    signals = replace(old, **made, derived=True, touches=(), timing=None)
-    pads = Sensing(Compliance(2.5e-4, 1e-6, 0.0), Compliance(4e-4, 1e-6, 0.0), 0.0, 0.0)
-    table = contacts(signals, pads, replace(aligned.fit.parameters, bias=np.zeros(4)))
-    found = table._finger(1, t > 2.0, making=True)
-    near = (t > 1.35) & (t < 1.505)
-    np.testing.assert_allclose(found.place[near], (squeeze - give)[near], atol=1e-6)
-    np.testing.assert_allclose(found.place[t > 1.51], second[t > 1.51], atol=1e-6)
-    np.testing.assert_allclose(found.rate[0, near], 0.05, rtol=1e-3)
