@@ -90,13 +90,12 @@ def _neighbours(f: Forms, effects: tuple[int, ...]) -> list[tuple[int, ...]]:
 
 
 def _linearised(f: Forms, effects: Sequence[int]) -> tuple[int, ...]:
-    """The same forms of effects, each as linearised beside those that are most like the rest of the set, last
-    of all."""
+    """The same forms of effects, each as linearised beside those that are most like the rest of the set."""
     of, out = f.gap.candidates, []
     for j in effects:
         rest = {of[i].name for i in effects} - {of[j].name}
         same = [j, *(i for i, c in enumerate(of) if c.form_of == of[j].form_of)]
-        out.append(min(same, key=lambda i: (len({*of[i].beside} ^ rest), len({*of[i].beside} - rest), -i)))
+        out.append(min(same, key=lambda i: len({*of[i].beside} ^ rest)))
     return tuple(sorted(out))
 
 

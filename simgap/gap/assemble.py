@@ -352,8 +352,16 @@ def together(
     def of(problem: Problem, healthy: Fitted, joint: Fitted) -> Gap:
         return replace(gap, candidates=(*gap.candidates, *_joint(problem, healthy, joint)))
 
-    return _carrying(gap, of(given, healthy, joint), redrawn,
-                     lambda other: of(other, on_other(other, healthy), on_other(other, joint)))  # fmt: skip
+    more = of(given, healthy, joint)
+    if gap.carried is None:
+        return more
+    kept = gap.carried.shape[2]
+
+    def on(other: Problem) -> np.ndarray:
+        return of(other, on_other(other, healthy), on_other(other, joint)).raw_columns[:, kept:]
+
+    noise = _spectra(gap.rows, carried(more.raw_columns[:, kept:], redrawn, on))
+    return replace(more, carried=np.concatenate([gap.carried, noise], 2))
 
 
 def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
@@ -375,42 +383,6 @@ def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
                               joint.jacobian[:, at : at + len(free)], doubts, rest))  # fmt: skip
         at += len(free)
     return out
-
-
-def after(
-    given: Problem, gap: Gap, healthy: Fitted, first: Fitted, joint: Sequence[Fitted],
-    redrawn: Sequence[Problem],
-) -> Gap:  # fmt: skip
-    """Add the last effects of joint fits as candidates, linearised after the `first` effect.
-
-    The shift of each is what its fit removes in excess of the first effect's shift there.
-    """
-
-    def of(problem: Problem, healthy: Fitted, first: Fitted, joint: Sequence[Fitted]) -> Gap:
-        one, own = _shifting(problem, first, healthy), []
-        for f in joint:
-            both = _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
-            by_first = one.shift + one.jacobian @ (f.u[first.columns[problem.num_common :]] - one.at)
-            mine = slice(first.columns.size, None)
-            own.append(_candidate(problem, f.effects[-1], f.columns[mine], f.u, both - by_first,
-                                  f.jacobian[:, mine], f.doubts - first.doubts, f.effects[:-1]))  # fmt: skip
-        return replace(gap, candidates=(*gap.candidates, *own))
-
-    def on(other: Problem) -> Gap:
-        plain = on_other(other, healthy)
-        one, *others = (on_other(other, f, plain.jacobian) for f in (first, *joint))
-        return of(other, plain, one, others)
-
-    return _carrying(gap, of(given, healthy, first, joint), redrawn, on)
-
-
-def _carrying(gap: Gap, more: Gap, redrawn: Sequence[Problem], on: Callable[[Problem], Gap]) -> Gap:
-    """Add the effect of sensor noise on the new candidates of `more`."""
-    if gap.carried is None:
-        return more
-    kept = gap.carried.shape[2]
-    noise = carried(more.raw_columns[:, kept:], redrawn, lambda other: on(other).raw_columns[:, kept:])
-    return replace(more, carried=np.concatenate([gap.carried, _spectra(gap.rows, noise)], 2))
 
 
 def _turning(given: Problem, angle: float) -> np.ndarray:

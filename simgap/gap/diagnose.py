@@ -16,13 +16,13 @@ from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
-from simgap.attribution.posterior import Forms, Model, fitted, forms
+from simgap.attribution.posterior import forms
 from simgap.attribution.problem import Candidate, Gap
 from simgap.attribution.search import sought, statistic
-from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
+from simgap.attribution.verdict import Cell, entries, log_odds, rows
 from simgap.effects import catalogue, effect_named, forms_of, free_parameters, name_of
 from simgap.effects.base import World, tips
-from simgap.gap.assemble import after, scatters, together
+from simgap.gap.assemble import scatters, together
 from simgap.gap.experiments import next_experiment
 from simgap.gap.frame import CHANNELS, check_forced, of_wrist
 from simgap.gap.problem import (
@@ -36,7 +36,7 @@ from simgap.gap.problem import (
     world_without,
 )
 from simgap.gap.residuals import net_forces
-from simgap.gap.search import PROMISING, Identified, Search, best_fit, search
+from simgap.gap.search import Identified, Search, search
 from simgap.progress import Progress, silent
 from simgap.report.finding import sentence, tables
 
@@ -225,7 +225,6 @@ def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
 
 
 STAGES = 12  # look: most stages that `progress` reports
-NIL = float(-np.log(ALARM))  # nats; a smaller statistic raises no alarm
 
 
 @dataclass(frozen=True, repr=False)
@@ -388,10 +387,9 @@ def attributed(
         seed: Of the draws behind intervals.
         healthy: Statistics of healthy recordings, drawn if there is an alarm.
     """
-    f, gap = forms(found.gap), found.gap
-    models: list[Model] | None = sought(f)
+    gap, models = found.gap, None
     if not forced:
-        gap, models = _after_first(found, f, models)
+        models = sought(forms(gap))
         leading = [c for j in models[0].effects if _shifts_signals(c := gap.candidates[j])]
         if leading:
             joint = _together(found, leading)
@@ -402,25 +400,6 @@ def attributed(
             gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, healthy, forced, seed, models=models, absorbed=absorbed)
-
-
-def _after_first(found: Search, f: Forms, models: list[Model]) -> tuple[Gap, list[Model]]:
-    """The gap and its sets, with every effect fitted after the first of the best set if that alone leaves a
-    gap.
-
-    Fitted separately, what another effect distorts resembles further effects.
-    """
-    gap, best = f.gap, models[0]
-    shifting = [j for j in best.effects if _shifts_signals(gap.candidates[j])]
-    first = min(shifting, key=lambda j: fitted(f, tuple(i for i in best.effects if i != j)).score, default=-1)
-    if first < 0 or statistic(f, models, (first,)) < NIL:
-        return gap, models
-    one = found.fits[first]
-    keys = [k for each in found.fits if name_of(k := each.effects[0]) != gap.candidates[first].name]
-    fits = [best_fit(found.problem, key, one) for key in keys]
-    promising = [each for each in fits if each.cost < one.cost - PROMISING]
-    gap = after(found.problem, gap, found.healthy, one, promising, found.redrawn)
-    return gap, sought(forms(gap))
 
 
 def _shifts_signals(c: Candidate) -> bool:

@@ -76,7 +76,7 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[np.ndarray]:
 
 
 def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
-    """Fit one form of an effect after those of `healthy`, which are refitted with the properties.
+    """Fit one form of an effect by itself, with the properties.
 
     Starts are ranked by the cost after a linear step in their amplitudes: a frequency cannot be found while
     its oscillation has no size. Properties start at their measured values, as without the effect they may
@@ -86,33 +86,29 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     Args:
         given: The problem.
         key: The form.
-        healthy: The fit to start from.
+        healthy: The fit without effects, to start from.
     """
     base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_common]
     base[: given.measured.size][given.measured.ravel()] = 0.0
     drawn = np.abs(healthy.u - base).max() > SURE  # more than the uncertainty of a touch
-    effects = (*healthy.effects, key)
     every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
-    ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
+    ranked = sorted(((*_linear_step(given, key, u, usual), u) for u in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < PROMISING:
-        return fit(given, effects, ranked[0][2], 0, usual)
+        return fit(given, (key,), ranked[0][2], 0, usual)
     leading = [u for _, u, _ in ranked[:LEADERS]]
     if len(leading) > 1:
-        leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
-    return fit(given, effects, leading[0], usual=usual)
+        leading = [min((fit(given, (key,), u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
+    return fit(given, (key,), leading[0], usual=usual)
 
 
-def _linear_step(
-    given: Problem, effects: tuple[str, ...], start: np.ndarray, usual: np.ndarray
-) -> tuple[float, np.ndarray]:
-    """Cost after one linear step of all but the last effect's gridded parameters, and the coordinates
-    there."""
-    fixed = [column for column, _ in _gridded(given, effects[-1])]
+def _linear_step(given: Problem, key: str, start: np.ndarray, usual: np.ndarray) -> tuple[float, np.ndarray]:
+    """Cost after one linear step of all but an effect's gridded parameters, and the coordinates there."""
+    fixed = [column for column, _ in _gridded(given, key)]
     low, high = limits(given)
-    columns = np.array([c for c in columns_of(given, effects) if c not in fixed])
+    columns = np.array([c for c in columns_of(given, (key,)) if c not in fixed])
     u = start.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    now = evaluated(given, effects, u, columns, usual)
+    now = evaluated(given, (key,), u, columns, usual)
     curvature = given.product(now.jacobian, now.jacobian) + np.eye(columns.size)
     pull = -given.product(now.jacobian, now.residual) - u[columns]
     step, _ = least(curvature, pull, low[columns] - u[columns], high[columns] - u[columns])

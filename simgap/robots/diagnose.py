@@ -151,7 +151,9 @@ def _diagnosed(
         said(f"the simulator diverges in {dropped}: they are left out")
     for one in search.identifiable.alike:
         if one.exact:
-            said(f"{', '.join(one.names)} act only together on these logs: no such log can tell them apart")
+            first, *rest = one.names
+            alike = f"as {', '.join(rest)} {'do together' if rest[1:] else 'does'}"
+            said(f"{first} acts on these logs {alike}: such logs do not tell them apart")
     tell("how far")
     far = shrinkage(best, nothing, composed, fold) if best.names else None
     verdict = verdict_on(search, best, far, phases, seed, bool(forced))

@@ -556,8 +556,6 @@ def test_an_effect_is_taken_as_linearised_beside_those_that_it_acts_with():
     assert _linearised(f, [0, 1]) == (0, 4)  # beside `a`, and nothing that does not act
     assert _linearised(f, [0, 1, 2]) == (2, 5, 6)
     assert _linearised(f, [1]) == (1,)
-    pair = [replace(a, beside=("b",)), replace(b, beside=("a",))]  # both together, after one of them alone
-    assert _linearised(forms(replace(gap, candidates=(a, b, c, d, after_a, *pair))), [0, 1]) == (5, 6)
 
 
 def test_what_is_known_of_a_random_effect_from_elsewhere_no_form_imitates():

@@ -12,7 +12,7 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import cosines
 from simgap.effects import effect_named
-from simgap.gap.assemble import after, gap_of, rows_of, scatters, together
+from simgap.gap.assemble import gap_of, rows_of, scatters, together
 from simgap.gap.frame import CHANNELS, build
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import derivatives, fit, neutral, problem, slots
@@ -75,22 +75,6 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
     assert [c.name for c in gap.candidates] == list(names)
     left = gap.residual - gap.nuisance[:, : given.num_common] @ joint.u[: given.num_common]
     left = left - sum(c.shift for c in gap.candidates)
-    np.testing.assert_allclose(left, joint.residual, atol=1e-8)
-
-
-@double_precision
-def test_an_effect_fitted_after_another_adds_to_it_what_both_take_off(healthy):
-    frame = healthy[0].frame
-    given = problem(replace(frame, world=frame.world._replace(give_normal=0.5 * frame.world.give_normal)))
-    plain = fit(given, (), neutral(given))
-    first = fit(given, ("fingertip_compliance",), plain.u)
-    joint = fit(given, (*first.effects, "link_length"), first.u)
-    gap = after(given, gap_of(given, plain, [first]), plain, first, [joint], ())
-    one, other = gap.candidates
-    assert (one.name, other.name) == ("fingertip_compliance", "link_length")
-    k = given.num_common
-    left = gap.residual - gap.nuisance[:, :k] @ joint.u[:k] - other.shift
-    left = left - one.shift - one.jacobian @ (joint.u[first.columns[k:]] - one.at)
     np.testing.assert_allclose(left, joint.residual, atol=1e-8)
 
 
