@@ -15,8 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from experiments.blind_check.diagnose import diagnose_folder
 from experiments.blind_check.judge import intervals_hold
 from experiments.robots_check.score import FLOOR
@@ -120,7 +118,7 @@ def table(found: dict[str, Any]) -> str:
     """docs/gap_results.md: open labs, one column a version of the code, or a set of labs."""
     runs: dict[str, list[dict[str, Any]]] = found["runs"]
 
-    def line(name: str, tiers: Sequence[str], *which: str, least: float = -np.inf) -> list[str]:
+    def line(name: str, tiers: Sequence[str], *which: str, least: float = float("-inf")) -> list[str]:
         cells = []
         for rows in runs.values():
             of = [r for r in rows if r["tier"] in tiers and (r["gain"] is None or r["gain"] >= least)]

@@ -87,16 +87,13 @@ def excluded(folder: Path) -> tuple[str, ...]:
 
 
 def _gains(found: Diagnosis) -> dict[str, float]:
-    """Gain of each single effect over none [nats], minus a nat per parameter (Akaike); of effects that shift
-    no signals, their log Bayes factor."""
-    healthy, f, out = found.search.healthy, forms(found.search.gap), {}
-    for j in range(len(found.search.fits), len(f.gap.candidates)):
-        name, score = f.gap.candidates[j].name, fitted(f, (j,)).score - f.log_odds
-        out[name] = max(out.get(name, -np.inf), float(score - fitted(f, ()).score))
-    for f in found.search.fits:
-        name, more = name_of(f.effects[0]), len(f.columns) - len(healthy.columns)
-        out[name] = max(out.get(name, -np.inf), float(healthy.cost - f.cost - more))
-    return {k: v for k, v in out.items() if np.isfinite(v)}
+    """Gain of each single effect [nats], a nat per parameter paid (Akaike); a scatter's log Bayes factor."""
+    healthy, f, fits = found.search.healthy, forms(found.search.gap), found.search.fits
+    paid = healthy.cost + len(healthy.columns)
+    every = [(name_of(one.effects[0]), float(paid - one.cost - len(one.columns))) for one in fits]
+    others, none = enumerate(f.gap.candidates[len(fits) :], len(fits)), fitted(f, ()).score + f.log_odds
+    every += [(c.name, float(fitted(f, (j,)).score - none)) for j, c in others]
+    return {name: max(v for n, v in every if n == name) for name, gain in every if np.isfinite(gain)}
 
 
 def _bic(found: Diagnosis) -> str:
