@@ -2,9 +2,8 @@
 
     python -m experiments.gap_drawn FOLDER ... --results DIR --run NAME [--output FILE.json]
 
-A FOLDER holds cases with labels.json next to them: those of another simulator, or those that
-`python -m experiments.blind_check open` draws. Diagnoses go to DIR/FOLDER/CASE.json, so that a run may be
-resumed, and the rows of this run stand under NAME in FILE.json (experiments/results/gap_labs.json).
+A FOLDER holds cases with labels.json next to them, as `python -m experiments.blind_check open` draws them.
+Diagnoses go to DIR/FOLDER/CASE.json, so that a run may be resumed, its rows under NAME in FILE.json.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from simgap.attribution.verdict import RECORD
 
 RESULT = Path(__file__).parent / "results" / "gap_labs.json"
 SEEN = 0.01  # probability to act below which an effect is not listed
+UNSEEN = ("missed", "too small")
 WEAK = 0.3  # of the gap of held-out trials: causes that explain less are none, and more left is a remainder
 
 
@@ -144,7 +144,7 @@ def table(found: dict[str, Any]) -> str:
         line("single: in a set", ["single"], "set"),
         line("single: named with others", ["single"], "beside others"),
         line("single: unknown", ["single"], "unknown"),
-        line("single: not noticed, or too small to matter", ["single"], "missed", "too small"),
+        line("single: not noticed, or too small to matter", ["single"], *UNSEEN),
         line("single: another name", ["single"], "wrong name"),
         line(f"single that gains {FLOOR:.0f} nats: named alone", ["single"], "named", least=FLOOR),
         line("the same: named alone or in a set", ["single"], "named", "set", least=FLOOR),
@@ -161,11 +161,11 @@ def table(found: dict[str, Any]) -> str:
         ["seconds of processor, median",
          *(str(round(sorted(r["seconds"] for r in rows)[len(rows) // 2]) or "") for rows in runs.values())],
     ]  # fmt: skip
-    of = [r for r in list(runs.values())[-1] if not is_right(r)]
-    said = [": ".join(filter(None, (r["outcome"], "+".join(r["causes"])))) for r in of]
+    of = [r for r in list(runs.values())[-1] if not is_right(r) and r["outcome"] not in UNSEEN]
+    said = (": ".join(filter(None, (r["outcome"], "+".join(r["causes"])))) for r in of)
     wrong = [f"{r['case']} {'+'.join(r['effects'])} ({what})" for r, what in zip(of, said, strict=True)]
     shown = markdown(["figure", *runs], [each for each in lines if any(each[1:])])
-    return f"{shown}\n\nNot right by the last of these: {'; '.join(wrong) or 'none'}."
+    return f"{shown}\n\nNeither right nor unseen by the last of these: {'; '.join(wrong) or 'none'}."
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
