@@ -122,6 +122,7 @@ def table(found: dict[str, Any]) -> str:
         cells = []
         for rows in runs.values():
             of = [r for r in rows if r["tier"] in tiers and (r["gain"] is None or r["gain"] >= least)]
+            of = of if least < 0 or any(r["gain"] for r in of) else []  # older code, which said none
             cells.append(f"{sum(r['outcome'] in which for r in of)} of {len(of)}" if of else "")
         return [name, *cells]
 
@@ -164,8 +165,8 @@ def table(found: dict[str, Any]) -> str:
     of = [r for r in list(runs.values())[-1] if not is_right(r) and r["outcome"] not in UNSEEN]
     said = (": ".join(filter(None, (r["outcome"], "+".join(r["causes"])))) for r in of)
     wrong = [f"{r['case']} {'+'.join(r['effects'])} ({what})" for r, what in zip(of, said, strict=True)]
-    shown = markdown(["figure", *runs], [each for each in lines if any(each[1:])])
-    return f"{shown}\n\nNeither right nor unseen by the last of these: {'; '.join(wrong) or 'none'}."
+    shown = markdown(["figure", *runs], [each for each in lines if any(each[1:])]) + "\n\n"
+    return f"{shown}Neither right nor unseen by the last of these: {'; '.join(wrong) or 'none'}."
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -189,9 +190,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not file.exists():
             file.write_text(json.dumps(diagnose_folder(case)) + "\n", encoding="utf-8")
         for key in (k for k in label if k.startswith("said_by_")):
-            said = label[key]
             body = {"error": "", "seconds": 0.0}
-            if said is not None:
+            if (said := label[key]) is not None:
                 body = {**said, "shrinkage": {"fraction": said["fraction"]}, "seconds": 0.0}
             runs.setdefault(key.removeprefix("said_by_"), []).append(row(label, body))
         one = row(label, json.loads(file.read_text(encoding="utf-8")))

@@ -342,7 +342,8 @@ def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     """What the logs leave open, the tables of every diagnosis, and held-out residuals."""
     rows, unseen = [], document["identifiability"]["unseen"]
     for one in document["identifiability"]["alike"][:6]:
-        how = "the first as the others" if one["exact"] else f"are alike but for {100 * one['own']:.1f} %"
+        near = f"are alike but for {100 * one['own']:.1f} %"
+        how = "the first acts as the others" if one["exact"] else near
         rows.append((", ".join(one["parameters"]), how))
     rows += [(", ".join(unseen[:8]), "cannot be seen")] if unseen else []
     out = [listed("what these logs leave open", (), rows)] if rows else []

@@ -242,12 +242,12 @@ def _held_side(
     t = f.t
     after = steps[k].state == FREE or steps[k + 1].name == "place"
     own = np.flatnonzero(path == (k + 1 if after else k))
-    read = [i for i in own if np.isfinite(f.force[i]).all()]
+    read = own[np.isfinite(f.force[own]).all(axis=1)]
     if after:
-        first = t[min((i for i in read if i > n), default=n + 1)]
-        return first, min(first + DRIFTS, max(t[own[-1]] if own.size else 0.0, first))
-    last = t[max((i for i in read if i <= n), default=n)]
-    return max(last - DRIFTS, min(t[own[0]] if own.size else np.inf, last)), last
+        first = float(t[read[read > n].min() if (read > n).any() else n + 1])
+        return first, min(first + DRIFTS, max(float(t[own[-1]]) if own.size else 0.0, first))
+    last = float(t[read[read <= n].max() if (read <= n).any() else n])
+    return max(last - DRIFTS, min(float(t[own[0]]) if own.size else np.inf, last)), last
 
 
 def to_spans(

@@ -476,14 +476,15 @@ class Search:
         """Judge in a cause's place what does the same by the same share, as a command's gain does what its
         motor's does: where the gap is large, straight lines do not lead from nothing to both."""
         every = {n: [*self.composed.effects[n].parameters.items()] for n in (out, *self.wanted)}
-        of_shares = [n for n, known in every.items() if [p.unit for _, p in known] == ["1"]]
-        for name in of_shares if out in of_shares else ():
-            ((short, p),), ((own, q),) = every[name], every[out]
+        shares = {n: known[0] for n, known in every.items() if [p.unit for _, p in known] == ["1"]}
+        for name, (short, p) in shares.items() if out in shares else ():
+            if name in best.names:
+                continue
+            own, q = shares[out]
             at = {short: p.nominal + best.point[out][own] - q.nominal}
             point = {**without(best.point, out), name: at}
             apart = best.linear.target - best.linear.residual - base_at(best.composed, point).rows
-            same = np.sum(best.covariances.whitener()(apart) ** 2) < SETTLED
-            if same and name not in best.names:
+            if np.sum(best.covariances.whitener()(apart) ** 2) < SETTLED:
                 one = self._judge(best.composed, (*best.less(out), name), point)
                 known = self.fitted.get(frozenset(one.names), one)
                 self.fitted[frozenset(one.names)] = max(one, known, key=lambda fitted: fitted.score)
