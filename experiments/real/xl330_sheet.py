@@ -24,6 +24,7 @@ from hmmseg.plot.style import BLUE, INK, ORANGE, canvas
 from simgap.robot_effects import STATED, UNMEASURED, effects_of
 from simgap.robots.calibrate import LONGEST, calibrate
 from simgap.robots.diagnose import diagnose
+from simgap.robots.linear import base_at
 from simgap.robots.model import Composed
 from simgap.robots.rows import noises
 from simgap.simulators.mjcf.load import Loaded, load_mjcf
@@ -98,7 +99,11 @@ def main() -> None:
             body = found.body() | {"processor": time.process_time() - begun}
             out[what] = body
             before, after = (1e3 * body["heldout"][k]["position"] for k in ("before", "after"))
-            print(f"{what}: held-out logs {before:.0f} -> {after:.1f} mrad, {body['processor']:.0f} s")
+            whole = found.composed
+            body["left"] = whole.rows.rms(whole.rows.observed - base_at(whole, found.point).rows)
+            inside = 1e3 * body["left"]["position"]
+            print(f"{what}: held-out logs {before:.0f} -> {after:.1f} mrad, {body['processor']:.0f} s;"
+                  f" all logs {inside:.1f}")  # fmt: skip
             print({n: rounded(p["mean"], 3) for n, p in body["parameters"].items()})
         if given.diagnose:
             begun = time.process_time()
