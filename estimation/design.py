@@ -459,8 +459,9 @@ def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndar
     pooled mean explains that better by (z^2 - 1) / 2 - log z nats; it is allowed if that makes it probable.
     """
     precision = 1.0 / variance
-    pooled = (mean * precision).sum(axis=0) / precision.sum(axis=0)
-    allowed = np.hypot(1.0 / np.sqrt(precision.sum(axis=0)), np.asarray(rig.systematic.force_bias))
+    total = np.maximum(precision.sum(axis=0), np.finfo(float).tiny)  # a force that is never read has none
+    pooled = (mean * precision).sum(axis=0) / total
+    allowed = np.hypot(1.0 / np.sqrt(total), np.asarray(rig.systematic.force_bias))
     z = np.maximum(np.abs(pooled) / allowed, 1.0)
     return np.where((z**2 - 1) / 2 - np.log(z) > np.log(1 / BIASED - 1), np.abs(pooled), 0.0)
 

@@ -159,10 +159,16 @@ def gravity_factor(signals: Signals, rig: Rig) -> np.ndarray:
     return inertia_factor(np.nan_to_num(acceleration(signals.t, signals.vy)), rig.gravity)
 
 
-def subtask_masks(times: np.ndarray, boundaries: np.ndarray, num_subtasks: int) -> np.ndarray:
-    """Booleans (num_alignments, num_subtasks, num_timesteps): which subtask each sample is in."""
-    index = (times[None, :, None] >= boundaries[:, None, :]).sum(axis=2)
-    return index[:, None, :] == np.arange(num_subtasks)[None, :, None]
+def subtask_masks(
+    times: np.ndarray, boundaries: np.ndarray, num_subtasks: int, reach: float = 0.0
+) -> np.ndarray:
+    """Booleans (num_alignments, num_subtasks, num_timesteps): which subtask each sample is in.
+
+    A mean over samples up to `reach` [s] to either side, across a boundary, is in none.
+    """
+    first, last = ((at[None, :, None] >= boundaries[:, None, :]).sum(axis=2)
+                   for at in (times - reach, times + reach))  # fmt: skip
+    return np.where(first == last, first, -1)[:, None, :] == np.arange(num_subtasks)[None, :, None]
 
 
 def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
@@ -233,9 +239,10 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
         thinned = thin(trial.signals)
         medians = np.array([[b.quantile(0.5) for b in trial.boundaries]])
         drawn = draw_boundaries(trial, rng, NUM_ALIGNMENTS)
-        best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps))[0]
+        reach = max(float(np.median(np.diff(thinned.t)) - np.median(np.diff(trial.signals.t))), 0.0) / 2
+        best = subtask_masks(thinned.t, np.maximum.accumulate(medians, axis=1), len(steps), reach)[0]
         present = held_as_described(trial.present, steps)
-        masks = subtask_masks(thinned.t, drawn, len(steps)) & present[None, :, None]
+        masks = subtask_masks(thinned.t, drawn, len(steps), reach) & present[None, :, None]
         readings = channel_values(thinned, rig)
         readings["force"] = readings["force"] / gravity_factor(thinned, rig)
         prepared.append((thinned, readings, best & present[:, None], masks))

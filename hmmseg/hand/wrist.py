@@ -275,7 +275,7 @@ HALVES = (
 def is_halved(trial: Trial) -> bool:
     """Whether the fingers' forces are halves of one wrist sensor's: two fingertips never feel the same."""
     pairs = [("fx1", "fx2"), ("fy1", "fy2")]
-    if not all(name in trial.channels for pair in pairs for name in pair):
+    if not all(name in trial.channels for name in ("x1", *pairs[0], *pairs[1])):
         return False
     same = [np.array_equal(trial.channels[a], trial.channels[b], equal_nan=True) for a, b in pairs]
     return all(same) and any(np.ptp(trial.channels[a][np.isfinite(trial.channels[a])]) > 0 for a, _ in pairs)

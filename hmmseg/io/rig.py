@@ -21,6 +21,8 @@ from hmmseg.io.schema import (
 )
 from hmmseg.io.units import Columns
 
+Link = Annotated[FinitePositive, Field(le=10)]  # limit: m; longer ones are in mm or cm
+Gravity = Annotated[FinitePositive, Field(le=100)]  # limit: m/s^2; of any place where hands are
 AXES = ("x", "y", "z")
 Axis = Literal["x", "y", "z"]
 Direction = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -149,7 +151,7 @@ class Finger(StrictTable):
     """
 
     base: tuple[Finite, Finite]
-    links: tuple[FinitePositive, FinitePositive]
+    links: tuple[Link, Link]
 
 
 class Fingertip(StrictTable):
@@ -241,7 +243,7 @@ class Rig(StrictTable):
         return parse_rig(source) if isinstance(source, dict) else read_rig(Path(str(source)))
 
     rate: FinitePositive | None = None
-    gravity: FinitePositive = 9.80665
+    gravity: Gravity = 9.80665
     fingers: dict[str, Finger] | None = None
     fingertip: Fingertip = Fingertip()
     noise: Noise = Noise()

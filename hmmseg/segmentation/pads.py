@@ -57,6 +57,7 @@ CONSTANTS = np.array([0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1])  # 
 LEAD_SD = 0.003  # prior: s; of a delay that is not the sensor's: foams lead by a few ms at most
 LATE_HANDS = 0.007  # prior: share of hands whose sensors delay their forces
 ENOUGH = 24  # numerics: squeezes that determine a delay
+PROBES = 8  # numerics: white noises that show how far joining and filtering average noise
 COMPLIANCES = np.geomspace(0.33, 3.0, 17)  # numerics: multiples of the nominal compliance
 UNSTATED = np.geomspace(4e-5, 1.2e-3, 17)  # numerics: m/N; compliances of nominally rigid pads
 LAW_SHARE, LAW_LEAD = 0.05, 0.0015  # prior: relative deviation of a pad's force from its law, and lead [s]
@@ -119,19 +120,15 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
     compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED
     log_prior = -(((compliances - prior[0]) / prior[1]) ** 2) / 2
     loads = [_loads(s, compliances) for s in squeezes]
+    noises = [_noise(s.t) for s in squeezes]
 
     def profiled(values: np.ndarray, filtered: bool) -> np.ndarray:
         """Log-likelihoods (len(values),) of shifts, or of time constants of a filter [s]."""
         total = log_prior[:, None]
-        for s, own in zip(squeezes, loads, strict=True):
-            if filtered:
-                place, share = _steps(s.t - s.t[0], own.shape[-1])
-                load, pace = lagging(own, np.exp(-STEP / values), place, share)
-            else:
-                clock = np.clip(s.t[:, None] - values, s.t[0], s.t[-1])
-                place, share = _steps(clock - s.t[0], own.shape[-1])
-                load, pace = (1 - share) * own[..., place] + share * own[..., place + 1]
-            total = total + _log_likelihood(s, compliances, load, pace)
+        for s, own, white in zip(squeezes, loads, noises, strict=True):
+            load, pace = _late(s.t, own, values, filtered)
+            left = np.mean(_late(s.t, white, values, filtered) ** 2, axis=(0, 1))
+            total = total + _log_likelihood(s, compliances, load, pace, left)
         return total.max(axis=0)
 
     log_lead = -((FINE / LEAD_SD) ** 2) / 2
@@ -153,21 +150,37 @@ def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
     load = np.nan_to_num(s.load)
     holds = load >= HOLD * np.quantile(load, FIRMEST)
     width = np.median(s.distance[holds] + compliances[:, None] * load[holds], axis=1, keepdims=True)
-    clock = np.minimum(np.arange(s.t[0], s.t[-1] + STEP, STEP), s.t[-1])
-    distance = _joined(s, clock)
+    distance = _joined(s.t, s.distance, s.rate)
     load = np.maximum(width - distance, 0.0) / compliances[:, None]
     return np.stack([load, np.abs(np.gradient(load, STEP, axis=1))])
 
 
-def _joined(s: Squeeze, clock: np.ndarray) -> np.ndarray:
-    """Distances [m] at times [s], on cubic Hermite pieces through the samples and their rates."""
-    before = np.clip(np.searchsorted(s.t, clock, side="right") - 1, 0, s.t.size - 2)
-    width = np.diff(s.t)[before]
-    u = (clock - s.t[before]) / width
-    left, right = s.distance[before], s.distance[before + 1]
-    start, end = width * s.rate[before], width * s.rate[before + 1]
+def _noise(t: np.ndarray) -> np.ndarray:
+    """White noise of samples at t (N,) [s], joined as distances are, (PROBES, num_steps)."""
+    white = np.random.default_rng(0).choice([-1.0, 1.0], (PROBES, t.size))
+    return _joined(t, white, np.gradient(white, t, axis=1))
+
+
+def _joined(t: np.ndarray, values: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    """Values (..., num_steps) at each STEP on cubic Hermite pieces through samples at t (N,) [s] and their
+    rates, (..., N)."""
+    clock = np.minimum(np.arange(t[0], t[-1] + STEP, STEP), t[-1])
+    before = np.clip(np.searchsorted(t, clock, side="right") - 1, 0, t.size - 2)
+    width = np.diff(t)[before]
+    u = (clock - t[before]) / width
+    left, right = values[..., before], values[..., before + 1]
+    start, end = width * rates[..., before], width * rates[..., before + 1]
     bend = start + end - 2 * (right - left)
     return left + u * (start + u * (3 * (right - left) - 2 * start - end + u * bend))
+
+
+def _late(t: np.ndarray, steps: np.ndarray, values: np.ndarray, filtered: bool) -> np.ndarray:
+    """Signals (..., num_steps) at each STEP as read at t (N,), (..., N, M): shifted by each of M values [s],
+    or `filtered` with these time constants."""
+    if filtered:
+        return lagging(steps, np.exp(-STEP / values), *_steps(t - t[0], steps.shape[-1]))
+    place, share = _steps(np.clip(t[:, None] - values, t[0], t[-1]) - t[0], steps.shape[-1])
+    return (1 - share) * steps[..., place] + share * steps[..., place + 1]
 
 
 def _steps(clock: np.ndarray, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
@@ -176,17 +189,23 @@ def _steps(clock: np.ndarray, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
     return place, clock / STEP - place
 
 
-def _log_likelihood(s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace: np.ndarray) -> np.ndarray:
-    """Log-likelihoods (C, M) of the forces of one squeeze, given loads and rates (C, N, M); Student-t.
+def _log_likelihood(
+    s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace: np.ndarray, left: np.ndarray
+) -> np.ndarray:
+    """Log-likelihoods (C, M) of one squeeze, given loads and rates (C, N, M); Student-t.
 
-    The distance's noise contributes only to loads that press.
+    The distance's noise contributes only to loads that press. Between samples, and by a filter, it is
+    averaged to a share `left` (M,) of its variance, which makes residuals smaller but no delay likelier.
+    Neither is a compliance for the noise that it makes of distances: the mean of forces given distances and
+    of distances given forces (Frisch 1934).
     """
     there = np.isfinite(s.load)
-    load, pace = load[:, there], pace[:, there]
+    force, load, pace = s.load[there][:, None], load[:, there], pace[:, there]
     noise = (s.sd_distance / compliances[:, None, None]) ** 2 * (load > s.sd_load)
-    variance = s.sd_load**2 + noise + (LAW_SHARE * load) ** 2 + (LAW_LEAD * pace) ** 2
-    apart = (s.load[there][:, None] - load) ** 2 / variance
-    return -DEPENDENT / 2 * ((TAIL + 1) * np.log1p(apart / TAIL) + np.log(variance)).sum(axis=1)
+    known = s.sd_load**2 + (LAW_SHARE * load) ** 2 + (LAW_LEAD * pace) ** 2
+    apart = (force - load) ** 2 / (known + left * noise)
+    total = ((TAIL + 1) * np.log1p(apart / TAIL) + np.log(known + noise)).sum(axis=1)
+    return -DEPENDENT / 2 * (total + (force > s.sd_load).sum() * np.log(compliances)[:, None])
 
 
 STIFFNESS_SD = 0.3  # prior: relative sd of a stiffness if the rig gives none: foams of one make differ so

@@ -161,6 +161,7 @@ def test_unexpected_biases_are_those_beyond_noise_and_the_rig():
     np.testing.assert_allclose(plain, [0.05, 0.0, 0.05, 0.0])
     admitted = Rig(systematic=Systematic(force_bias=(0.05, 0.0, 0.0, 0.0)))
     np.testing.assert_allclose(unexpected_bias(mean, variance, admitted), [0.0, 0.0, 0.05, 0.0])
+    np.testing.assert_array_equal(unexpected_bias(np.zeros((3, 4)), np.full((3, 4), np.inf), Rig()), 0.0)
 
 
 def test_rigid_pads_that_give_are_told_and_allowed_for(case, aligned):

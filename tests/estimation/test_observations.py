@@ -112,6 +112,14 @@ def test_every_sample_belongs_to_one_subtask():
     np.testing.assert_array_equal(masks[1].argmax(axis=0), [1] * 9 + [2])  # half-open: 0.0 starts the second
 
 
+def test_a_mean_over_samples_across_a_boundary_is_in_no_subtask():
+    """At 500 Hz, means from before a fast touch to after it showed pads two thirds too soft."""
+    boundaries, times = np.array([[0.26, 0.58]]), np.arange(10) / 10
+    alone, wide = (subtask_masks(times, boundaries, 3, reach)[0] for reach in (0.0, 0.05))
+    assert alone.any(axis=0).all() and not (wide & ~alone).any()
+    np.testing.assert_array_equal(np.flatnonzero(~wide.any(axis=0)), [3, 6])
+
+
 def test_drawn_boundaries_follow_their_posterior_and_keep_order():
     rng = np.random.default_rng(4)
     times = np.linspace(0, 1, 501)

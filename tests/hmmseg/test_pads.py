@@ -195,6 +195,25 @@ def test_a_small_delay_is_found_and_is_no_sensor_s(delay):
     assert not found.late and found.delay == pytest.approx(delay, abs=max(3 * found.sd, 1e-3))
 
 
+def half_a_grip(step, noise, sd_load, seed):
+    """Fingers that close on a block, or open if the seed is odd; no velocities."""
+    rng, fine = np.random.default_rng(seed), np.arange(0, 1.0, 1e-4)
+    way = np.clip((fine - 0.2) / 0.35, 0, 1)
+    distance = (WIDTH + 0.01 - 0.0105 * way**3 * (10 - 15 * way + 6 * way**2))[:: (-1) ** seed]
+    t = np.arange(rng.uniform(0, step), 1.0, step)
+    seen = np.interp(t, fine, distance) + noise * rng.standard_normal(t.size)
+    load = np.interp(t, fine, np.maximum(WIDTH - distance, 0)) / COMPLIANCE
+    read = load + sd_load * rng.standard_normal(t.size)
+    return Squeeze(t, seen, np.gradient(seen, t), read, noise, sd_load)
+
+
+@pytest.mark.parametrize("step, noise, sd_load", [(0.005, 3e-5, 0.017), (0.01, 2.8e-4, 0.14)])
+def test_noise_that_joining_and_filters_average_tells_of_no_delay(step, noise, sd_load):
+    """Half a sample late, or filtered, the distances' noise is smaller; nothing else speaks for it."""
+    found = lateness([half_a_grip(step, noise, sd_load, 100 + i) for i in range(16)], PRIOR)
+    assert not found.late and abs(found.delay) < 2 * found.sd
+
+
 def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
     fine = np.arange(0, 1.0, 1e-4)
     force = 4 * np.clip((fine - 0.31) / 0.2, 0, 1)

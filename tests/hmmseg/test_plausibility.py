@@ -328,3 +328,9 @@ def test_the_lines_mend_what_they_refuse(performed):
             np.testing.assert_allclose(
                 np.abs(trial.channels[name]), np.abs(healthy.channels[name]), atol=0.02
             )
+
+
+def test_one_force_on_both_fingers_of_a_jointed_hand_is_refused():
+    """Such a hand has no tips to read as a gripper's halves: it ended in a traceback."""
+    with pytest.raises(InputError, match="fx1 and fx2 push the same way"):
+        read_trial({**JOINT, "fx2": JOINT["fx1"], "fy2": JOINT["fy1"]}, JOINTED)
