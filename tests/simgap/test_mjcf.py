@@ -118,7 +118,7 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
         ("window = 1e9", "window.*equal to 1000000"), ('window = "long"', "window"),
         ("window = nan", "window"), ("time = 3", "time"), ("time = []", "time"),
         ('time = {column = "t", unit = "parsec"}', "unit"), ("keyframe = 3", "keyframe.*valid string"),
-        ('keyframe = "home"', "no keyframe home"), ("windw = 1", "windw"),
+        ('keyframe = "home"', "no keyframe home; expected no name"), ("windw = 1", "windw"),
     ]),
 ])  # fmt: skip
 def test_a_map_at_fault_is_said_in_a_line(files, described, line):
@@ -130,6 +130,16 @@ def test_a_map_at_fault_is_said_in_a_line(files, described, line):
 def test_a_model_whose_time_step_is_none(files, step):
     with pytest.raises(InputError, match=r"swing\.xml"):
         load_mjcf(*files(XML.replace('"0.001"', f'"{step}"')))
+
+
+@pytest.mark.parametrize(("xml", "line"), [
+    (XML.replace('axis="0 1 0" range="-3 3"', 'type="ball"').replace("motor name", 'motor gear="1 0 0" name'),
+     "columns.q.joint: pivot is no hinge or slide; expected the seven columns"),
+    (XML.replace("</worldbody>", ""), "does not read it: .*line number=.*worldbody"),
+])  # fmt: skip
+def test_a_model_at_fault_is_said_in_a_line(files, xml, line):
+    with pytest.raises(InputError, match=f"(?i){line}"):
+        load_mjcf(*files(xml))
 
 
 def test_a_candidate_that_is_none_is_said(files):

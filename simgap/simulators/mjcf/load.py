@@ -97,7 +97,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
         spec = mujoco.MjSpec.from_file(str(xml))
         plain = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {str(error).splitlines()[0]}") from None
+        raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {error}") from None
     if not spec.actuators:
         _add_motors(spec, described.columns, str(map_file))
         plain = spec.compile()
@@ -111,6 +111,9 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
 
     for column, m in described.columns.items():
         check(f"columns.{column}", m.thing, m.name, names_of(plain, m.thing))
+        if m.thing == "joint" and int(plain.joint(m.name).type.item()) not in (HINGE, SLIDE):
+            raise InputError(f"{map_file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
+                             "the seven columns of its body's pose")  # fmt: skip
     if described.keyframe is not None:
         check("keyframe", "keyframe", described.keyframe, names_of(plain, "key"))
     for name in candidates:
@@ -214,9 +217,6 @@ def _simulator(
         sensors[column] = int(model.sensor_adr[number]) + at
         if m.thing == "joint" and m.kind == "position":
             joints[column] = object_id(model, "joint", m.name)
-            if int(model.jnt_type[joints[column]]) not in (HINGE, SLIDE):
-                raise InputError(f"{file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
-                                 "the seven columns of its body's pose")  # fmt: skip
         if m.thing == "body":
             poses.setdefault(m.name, {})[m.axis] = column
     free = {}
