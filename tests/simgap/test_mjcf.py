@@ -303,6 +303,26 @@ def turning(files, described: str = TURN, more: str = "", u: np.ndarray | None =
     return found, run
 
 
+@pytest.mark.parametrize(("kind", "number", "other"), [
+    ("muscle", 'lengthrange="-1 1" force="%s"', ""), ("damper", 'kv="%s" ctrlrange="0 1"', ""),
+    ("dcmotor", 'motorconst="%s" resistance="20"', "DCMOTOR"),
+])  # fmt: skip
+def test_the_gain_of_any_actuator_is_its_strength(files, kind, number, other):
+    """The first of a muscle's numbers is a length, of a motor's a resistance, and a damper's is zero."""
+    if other and not hasattr(mujoco.mjtGain, f"mjGAIN_{other}"):
+        pytest.skip("not in this MuJoCo")
+    driven = XML.replace('<motor name="m" joint="pivot"/>', f'<{kind} name="m" joint="pivot" {number}/>')
+    log = Recording("a.csv", np.arange(0, 0.5, 0.01), {"q": np.zeros(50), "u": np.full(50, 0.5)})
+
+    def run(strength: float, **changed: float) -> np.ndarray:
+        found = load_mjcf(*files(driven % strength, MAP.replace('unit = "Nm"', "")))
+        found.effects([log])
+        return found.simulator.simulate(changed, log, {"q": 0.5, "q_rate": 2.0})["q"]
+
+    assert np.ptp(run(0.5) - run(0.4)) > 1e-3
+    np.testing.assert_allclose(run(0.5, **{"actuator:m.gain": -0.2}), run(0.4), atol=1e-9)
+
+
 @pytest.mark.parametrize("kind", ["position", "velocity"])
 def test_the_gain_of_a_servo_is_how_stiffly_it_follows(files, kind):
     def run(stiff: float, **changed: float) -> np.ndarray:
