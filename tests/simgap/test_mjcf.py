@@ -182,6 +182,13 @@ def test_goals_are_checked_in_what_the_actuator_moves(files, tmp_path, moves):
     assert not read_back(found, tmp_path, np.sin(t), np.degrees(np.sin(t))).warnings
 
 
+@pytest.mark.parametrize(("unit", "si"), [("deg", "rad"), ("mNm", "Nm"), ("%", "1"), ("V", "1")])
+def test_a_command_has_the_unit_of_its_values(files, unit, si):
+    """Of goals in degrees an offset in rad was called one in deg; commands in mNm had no candidates."""
+    found = load_mjcf(*files(described=MAP.replace('"Nm"', f'"{unit}"')))
+    assert found.simulator.channels["u"].unit == si
+
+
 def test_goals_of_rates_in_degrees_are_told(files, tmp_path):
     servo = XML.replace('<motor name="m" joint="pivot"/>', '<velocity name="m" joint="pivot" kv="9"/>')
     found = load_mjcf(*files(servo, MAP.replace('unit = "Nm"', 'unit = "rad/s"')))

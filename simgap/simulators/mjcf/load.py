@@ -254,7 +254,10 @@ def _turns(model: Any, m: Mapped) -> bool:
 def _unit(model: Any, m: Mapped) -> str:
     """The SI unit of a column."""
     if m.kind == "command":
-        return "1" if m.unit is None else str(m.unit)
+        what = UNITS.get(known_unit(str(m.unit)) or "", ("number",))[0]
+        if what == "voltage":  # a motor is driven by it as by a duty
+            return "1"
+        return next(name for name, (of, size) in UNITS.items() if of == what and size == 1.0)
     if m.thing in ("body", "site"):
         return "1" if m.axis.startswith("q") else "m"
     return READ[m.thing, m.kind][1 if _turns(model, m) else 2]
