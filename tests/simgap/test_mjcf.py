@@ -157,6 +157,19 @@ def test_degrees_where_radians_are_declared_are_named(files, tmp_path):
         read_back(found, tmp_path, np.degrees(20 * log["q"]), 0 * log.t)
 
 
+@pytest.mark.parametrize("unit", ["", 'unit = "rad"\n'])
+def test_a_wheel_turns_as_often_as_it_does_if_its_unit_is_stated(files, tmp_path, unit):
+    table = MAP.replace('joint = "pivot"\n', f'joint = "pivot"\n{unit}')
+    found = load_mjcf(*files(XML.replace('range="-3 3"', ""), table))
+    t = np.arange(0, 5, 0.01)
+    np.savetxt(tmp_path / "a.csv", np.c_[t, 12 * t, 0 * t], delimiter=",", header="t,q,u", comments="")
+    if unit:
+        assert found.read(tmp_path / "a.csv")["q"][-1] == pytest.approx(59.88)
+    else:
+        with pytest.raises(InputError, match=r"expected unit = .deg. in the map"):
+            found.read(tmp_path / "a.csv")
+
+
 def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, tmp_path):
     servo = '<position name="m" joint="pivot" kp="9" ctrlrange="-0.5 0.5" ctrllimited="true"/>'
     goals = MAP.replace('unit = "Nm"', 'unit = "rad"')

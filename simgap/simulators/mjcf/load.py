@@ -275,7 +275,7 @@ def _check_unit(where: str, m: Mapped, si: str) -> None:
 
 SHORTEST = 1e-6  # limit: s of a solver's step; a second of it would take minutes
 LATITUDE = 0.2  # limit: share of a joint's range by which logs may exceed it
-FULL_TURNS = (-math.tau * 4, math.tau * 4)  # limit: rad; the range of a joint that states none
+FULL_TURNS = (-math.tau * 4, math.tau * 4)  # limit: rad; of a joint without a range or a unit
 
 
 def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
@@ -284,6 +284,8 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
         if m.thing != "joint" or m.kind != "position":
             continue
         joint, low, high = model.joint(m.name).id, np.nanmin(log[column]), np.nanmax(log[column])
+        if m.unit is not None and not model.jnt_limited[joint]:  # such as a wheel's
+            continue
         least, most = (float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else FULL_TURNS
         slack = LATITUDE * (most - least)
         if not (least - slack <= low and high <= most + slack):
