@@ -22,7 +22,7 @@ from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
 from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
 from simgap.simulators.mjcf.map import proposed_map  # noqa: E402
 from simgap.simulators.mjcf.runs import Held, _carried_out, _commanded  # noqa: E402
-from simgap.simulators.mjcf.setting import FIELDS, changed_model  # noqa: E402
+from simgap.simulators.mjcf.setting import FIELDS, changed_model, setting_of  # noqa: E402
 from simgap.simulators.mjcf.transmission import Motion, periods  # noqa: E402
 
 XML = """<mujoco model="swing">
@@ -193,6 +193,16 @@ def test_goals_are_checked_in_what_the_actuator_moves(files, tmp_path, moves):
     model = servo.replace("</worldbody>", belt)
     found, t = load_mjcf(*files(model, MAP.replace('unit = "Nm"', 'unit = "rad"'))), np.arange(0, 2, 0.01)
     assert not read_back(found, tmp_path, np.sin(t), np.degrees(np.sin(t))).warnings
+
+
+@pytest.mark.parametrize(("kind", "units"), [("hinge", ["N m", "N m"]), ("slide", ["N", "N"])])
+def test_what_a_slide_s_actuator_gives_is_a_force(files, kind, units):
+    servo = '<position name="m" joint="pivot" kp="9" kv="1" forcerange="-2 2"/>'
+    xml = XML.replace('<motor name="m" joint="pivot"/>', servo).replace('axis="0 1 0"', f'type="{kind}"')
+    model = load_mjcf(*files(xml, f'{MAP}[columns.f]\nactuator = "m"\nkind = "force"')).simulator
+    found = [model.channels["f"].unit, setting_of(model.model, "actuator:m.limit").unit]
+    assert found == units
+    assert setting_of(model.model, "actuator:m.damping").unit.startswith(f"{units[0]} s")
 
 
 @pytest.mark.parametrize(("unit", "si"), [("deg", "rad"), ("mNm", "Nm"), ("%", "1"), ("V", "1")])

@@ -26,6 +26,7 @@ from simgap.simulators.mjcf.setting import (
     object_id,
     only_slides,
     setting_of,
+    turns,
 )
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
@@ -167,7 +168,7 @@ READ = {
     ("joint", "position"): ("JOINTPOS", "rad", "m"),
     ("joint", "velocity"): ("JOINTVEL", "rad/s", "m/s"),
     ("joint", "torque"): ("JOINTACTFRC", "N m", "N"),
-    ("actuator", "force"): ("ACTUATORFRC", "N m", "N m"),
+    ("actuator", "force"): ("ACTUATORFRC", "N m", "N"),
     ("sensor", "position"): ("", "m", "m"),
     ("sensor", "velocity"): ("", "m/s", "m/s"),
     ("sensor", "force"): ("", "N", "N"),
@@ -260,6 +261,8 @@ def _unit(model: Any, m: Mapped) -> str:
         return next(name for name, (of, size) in UNITS.items() if of == what and size == 1.0)
     if m.thing in ("body", "site"):
         return "1" if m.axis.startswith("q") else "m"
+    if m.thing == "actuator":
+        return READ[m.thing, m.kind][1 if turns(model, object_id(model, "actuator", m.name)) else 2]
     return READ[m.thing, m.kind][1 if _turns(model, m) else 2]
 
 
