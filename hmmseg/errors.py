@@ -32,5 +32,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """Phrase naming the known word nearest to `word` in meaning or spelling, for error messages."""
     known = sorted(known)
     meant = ALSO_CALLED.get(word.lower())
+    if not known:
+        return "no name, as there is none of these"
     close = [meant] if meant in known else difflib.get_close_matches(word, known, n=1, cutoff=0.0)
     return f"one of {', '.join(known)}" + (f" (did you mean {close[0]}?)" if close else "")

@@ -14,13 +14,19 @@ def robust_sd(residual: np.ndarray) -> float:
     return NORMAL * float(np.median(np.abs(residual)))
 
 
-def white_sd(values: np.ndarray, order: int = 2) -> float:
+WITHIN = (np.arange(16) - 7.5) / 16  # numerics: places within a step of a channel
+
+
+def white_sd(values: np.ndarray, order: int = 2, step: float = 0.0) -> float:
     """Standard deviation of white noise, from differences of this order along the first axis.
 
     A difference of order k has (2 k choose k) times the variance of the noise; the median absolute value
-    ignores the few samples at which the signal itself bends.
+    ignores the few samples at which the signal itself bends. Of readings in steps that median would be a
+    whole number of steps, so every difference counts as spread over its `step`.
     """
-    return robust_sd(np.diff(values, order, axis=0)) / np.sqrt(comb(2 * order, order))
+    differences = np.diff(values, order, axis=0)
+    sd = robust_sd(np.add.outer(step * WITHIN, differences)) if step else robust_sd(differences)
+    return float(np.sqrt(max(sd**2 - step**2 / 12, 0.0) / comb(2 * order, order)))
 
 
 def coarse_step(values: np.ndarray) -> float:

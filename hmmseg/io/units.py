@@ -42,6 +42,7 @@ UNITS: dict[str, tuple[str, float]] = {
     "kgf": ("force", 9.80665), "lbf": ("force", 4.4482216152605),
     "Nm": ("torque", 1.0), "mNm": ("torque", 1e-3), "Nmm": ("torque", 1e-3), "Ncm": ("torque", 1e-2),
     "A": ("current", 1.0), "mA": ("current", 1e-3),
+    "V": ("voltage", 1.0), "mV": ("voltage", 1e-3),
     "kg": ("mass", 1.0), "g": ("mass", 1e-3),
     "1": ("number", 1.0), "%": ("number", 0.01),
 }  # fmt: skip
@@ -53,6 +54,7 @@ SPELLINGS = {
     "°/s": "deg/s", "radian": "rad", "radians": "rad", "newton": "N", "newtons": "N", "n": "N",
     "mn": "mN", "kn": "kN", "n.m": "Nm", "n*m": "Nm", "n-m": "Nm", "nm": "Nm", "n·m": "Nm",
     "n.mm": "Nmm", "nmm": "Nmm", "mm/sec": "mm/s", "m/sec": "m/s", "amp": "A", "amps": "A",
+    "volt": "V", "volts": "V",
 }  # fmt: skip
 
 

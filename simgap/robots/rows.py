@@ -148,14 +148,14 @@ def resolution(values: np.ndarray) -> float:
     return step if np.quantile(away, 0.95) < 0.05 else 0.0
 
 
-def estimate_noise(recordings: Sequence[Recording], name: str) -> float:
-    """Robust standard deviation of a channel's white noise from its differences.
+def estimate_noise(recordings: Sequence[Recording], name: str, step: float = 0.0) -> float:
+    """Robust standard deviation of a channel's white noise from its differences; read in steps of `step`.
 
     Motion only adds to differences, so the least over ORDERS counts: a second difference is blind to straight
     lines, a fourth to cubics.
     """
     values = np.concatenate([r[name][np.isfinite(r[name])] for r in recordings])
-    return min((white_sd(values, order) for order in ORDERS if values.size > order), default=1.0)
+    return min((white_sd(values, order, step) for order in ORDERS if values.size > order), default=1.0)
 
 
 def noises(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, float]:
@@ -165,7 +165,7 @@ def noises(simulator: Simulator, recordings: Sequence[Recording]) -> dict[str, f
         if channel.kind == "command":
             continue
         step = max(resolution(r[name]) for r in recordings)
-        stated = channel.noise if np.isfinite(channel.noise) else estimate_noise(recordings, name)
+        stated = channel.noise if np.isfinite(channel.noise) else estimate_noise(recordings, name, step)
         sd = max(stated, step / np.sqrt(12.0))
         out[name] = sd if sd > 0 else 1e-6 * max(1.0, float(np.nanstd(recordings[0][name])))
     return out

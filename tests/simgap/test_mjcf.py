@@ -22,7 +22,7 @@ from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
 from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
 from simgap.simulators.mjcf.map import proposed_map  # noqa: E402
 from simgap.simulators.mjcf.runs import Held, _carried_out, _commanded  # noqa: E402
-from simgap.simulators.mjcf.setting import FIELDS, changed_model  # noqa: E402
+from simgap.simulators.mjcf.setting import FIELDS, changed_model, setting_of  # noqa: E402
 from simgap.simulators.mjcf.transmission import Motion, periods  # noqa: E402
 
 XML = """<mujoco model="swing">
@@ -118,7 +118,7 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
         ("window = 1e9", "window.*equal to 1000000"), ('window = "long"', "window"),
         ("window = nan", "window"), ("time = 3", "time"), ("time = []", "time"),
         ('time = {column = "t", unit = "parsec"}', "unit"), ("keyframe = 3", "keyframe.*valid string"),
-        ('keyframe = "home"', "no keyframe home"), ("windw = 1", "windw"),
+        ('keyframe = "home"', "no keyframe home; expected no name"), ("windw = 1", "windw"),
     ]),
 ])  # fmt: skip
 def test_a_map_at_fault_is_said_in_a_line(files, described, line):
@@ -130,6 +130,16 @@ def test_a_map_at_fault_is_said_in_a_line(files, described, line):
 def test_a_model_whose_time_step_is_none(files, step):
     with pytest.raises(InputError, match=r"swing\.xml"):
         load_mjcf(*files(XML.replace('"0.001"', f'"{step}"')))
+
+
+@pytest.mark.parametrize(("xml", "line"), [
+    (XML.replace('axis="0 1 0" range="-3 3"', 'type="ball"').replace("motor name", 'motor gear="1 0 0" name'),
+     "columns.q.joint: pivot is no hinge or slide; expected the seven columns"),
+    (XML.replace("</worldbody>", ""), "does not read it: .*line number=.*worldbody"),
+])  # fmt: skip
+def test_a_model_at_fault_is_said_in_a_line(files, xml, line):
+    with pytest.raises(InputError, match=f"(?i){line}"):
+        load_mjcf(*files(xml))
 
 
 def test_a_candidate_that_is_none_is_said(files):
@@ -145,6 +155,19 @@ def test_degrees_where_radians_are_declared_are_named(files, tmp_path):
         InputError, match=r"column q: .* rad, beyond joint pivot's -3 to 3; expected unit = .deg"
     ):
         read_back(found, tmp_path, np.degrees(20 * log["q"]), 0 * log.t)
+
+
+@pytest.mark.parametrize("unit", ["", 'unit = "rad"\n'])
+def test_a_wheel_turns_as_often_as_it_does_if_its_unit_is_stated(files, tmp_path, unit):
+    table = MAP.replace('joint = "pivot"\n', f'joint = "pivot"\n{unit}')
+    found = load_mjcf(*files(XML.replace('range="-3 3"', ""), table))
+    t = np.arange(0, 5, 0.01)
+    np.savetxt(tmp_path / "a.csv", np.c_[t, 12 * t, 0 * t], delimiter=",", header="t,q,u", comments="")
+    if unit:
+        assert found.read(tmp_path / "a.csv")["q"][-1] == pytest.approx(59.88)
+    else:
+        with pytest.raises(InputError, match=r"expected unit = .deg. in the map"):
+            found.read(tmp_path / "a.csv")
 
 
 def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, tmp_path):
@@ -170,6 +193,23 @@ def test_goals_are_checked_in_what_the_actuator_moves(files, tmp_path, moves):
     model = servo.replace("</worldbody>", belt)
     found, t = load_mjcf(*files(model, MAP.replace('unit = "Nm"', 'unit = "rad"'))), np.arange(0, 2, 0.01)
     assert not read_back(found, tmp_path, np.sin(t), np.degrees(np.sin(t))).warnings
+
+
+@pytest.mark.parametrize(("kind", "units"), [("hinge", ["N m", "N m"]), ("slide", ["N", "N"])])
+def test_what_a_slide_s_actuator_gives_is_a_force(files, kind, units):
+    servo = '<position name="m" joint="pivot" kp="9" kv="1" forcerange="-2 2"/>'
+    xml = XML.replace('<motor name="m" joint="pivot"/>', servo).replace('axis="0 1 0"', f'type="{kind}"')
+    model = load_mjcf(*files(xml, f'{MAP}[columns.f]\nactuator = "m"\nkind = "force"')).simulator
+    found = [model.channels["f"].unit, setting_of(model.model, "actuator:m.limit").unit]
+    assert found == units
+    assert setting_of(model.model, "actuator:m.damping").unit.startswith(f"{units[0]} s")
+
+
+@pytest.mark.parametrize(("unit", "si"), [("deg", "rad"), ("mNm", "Nm"), ("%", "1"), ("V", "1")])
+def test_a_command_has_the_unit_of_its_values(files, unit, si):
+    """Of goals in degrees an offset in rad was called one in deg; commands in mNm had no candidates."""
+    found = load_mjcf(*files(described=MAP.replace('"Nm"', f'"{unit}"')))
+    assert found.simulator.channels["u"].unit == si
 
 
 def test_goals_of_rates_in_degrees_are_told(files, tmp_path):
@@ -291,6 +331,26 @@ def turning(files, described: str = TURN, more: str = "", u: np.ndarray | None =
         return found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 1.8})["q"]
 
     return found, run
+
+
+@pytest.mark.parametrize(("kind", "number", "other"), [
+    ("muscle", 'lengthrange="-1 1" force="%s"', ""), ("damper", 'kv="%s" ctrlrange="0 1"', ""),
+    ("dcmotor", 'motorconst="%s" resistance="20"', "DCMOTOR"),
+])  # fmt: skip
+def test_the_gain_of_any_actuator_is_its_strength(files, kind, number, other):
+    """The first of a muscle's numbers is a length, of a motor's a resistance, and a damper's is zero."""
+    if other and not hasattr(mujoco.mjtGain, f"mjGAIN_{other}"):
+        pytest.skip("not in this MuJoCo")
+    driven = XML.replace('<motor name="m" joint="pivot"/>', f'<{kind} name="m" joint="pivot" {number}/>')
+    log = Recording("a.csv", np.arange(0, 0.5, 0.01), {"q": np.zeros(50), "u": np.full(50, 0.5)})
+
+    def run(strength: float, **changed: float) -> np.ndarray:
+        found = load_mjcf(*files(driven % strength, MAP.replace('unit = "Nm"', "")))
+        found.effects([log])
+        return found.simulator.simulate(changed, log, {"q": 0.5, "q_rate": 2.0})["q"]
+
+    assert np.ptp(run(0.5) - run(0.4)) > 1e-3
+    np.testing.assert_allclose(run(0.5, **{"actuator:m.gain": -0.2}), run(0.4), atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["position", "velocity"])

@@ -225,6 +225,16 @@ def test_motion_is_no_noise(course):
     assert estimate_noise([log], "z") == pytest.approx(2e-5, rel=0.1)
 
 
+@pytest.mark.parametrize("noise", [0.6, 0.75, 0.9, 1.2])
+def test_noise_of_a_step_of_the_encoder_is_estimated(noise):
+    """Of readings in steps a median of differences is a whole number of steps: 25 % too little."""
+    t, rng = np.arange(6000) / 500, np.random.default_rng(0)
+    read = 1e-4 * np.round(1e4 * np.sin(3 * t) + noise * rng.standard_normal(t.size))
+    wanted = 1e-4 * np.sqrt(noise**2 + 1 / 12)
+    log = Recording("log.csv", t, {"z": read})
+    assert estimate_noise([log], "z", 1e-4) == pytest.approx(wanted, rel=0.06)
+
+
 def test_a_log_too_short_for_a_difference_tells_none():
     log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
     assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))

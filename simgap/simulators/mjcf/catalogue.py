@@ -32,6 +32,7 @@ from simgap.simulators.mjcf.setting import (
     payload,
     payload_place,
     setting_of,
+    strength_of,
 )
 from simgap.simulators.mjcf.transmission import (
     SHARE,
@@ -147,9 +148,10 @@ class _Catalogue:
         m = self.model
         for a in sorted({*self.simulator.driven.values()}):
             name, head = name_of(m, "actuator", a), f"actuator:{name_of(m, 'actuator', a)}"
-            if m.actuator_gainprm[a, 0]:
+            if np.any(m.actuator_gainprm[a, strength_of(m, a)]):
                 says = f"gain of {name} (of a servo, how stiffly it follows)"
                 self.add(f"{head}.gain", SIZE, says, low=-0.9)
+            if m.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
                 sd = SIZE * abs(float(m.actuator_biasprm[a, 2]))
                 self.add(f"{head}.damping", sd, f"velocity gain of {name}", low=0.0)
             if most_of(m, a) and int(m.actuator_trntype[a]) == JOINT:

@@ -26,6 +26,7 @@ from simgap.simulators.mjcf.setting import (
     object_id,
     only_slides,
     setting_of,
+    turns,
 )
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
@@ -97,7 +98,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
         spec = mujoco.MjSpec.from_file(str(xml))
         plain = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {str(error).splitlines()[0]}") from None
+        raise InputError(f"--mjcf {xml}", f"MuJoCo does not read it: {error}") from None
     if not spec.actuators:
         _add_motors(spec, described.columns, str(map_file))
         plain = spec.compile()
@@ -111,6 +112,9 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
 
     for column, m in described.columns.items():
         check(f"columns.{column}", m.thing, m.name, names_of(plain, m.thing))
+        if m.thing == "joint" and int(plain.joint(m.name).type.item()) not in (HINGE, SLIDE):
+            raise InputError(f"{map_file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
+                             "the seven columns of its body's pose")  # fmt: skip
     if described.keyframe is not None:
         check("keyframe", "keyframe", described.keyframe, names_of(plain, "key"))
     for name in candidates:
@@ -164,7 +168,7 @@ READ = {
     ("joint", "position"): ("JOINTPOS", "rad", "m"),
     ("joint", "velocity"): ("JOINTVEL", "rad/s", "m/s"),
     ("joint", "torque"): ("JOINTACTFRC", "N m", "N"),
-    ("actuator", "force"): ("ACTUATORFRC", "N m", "N m"),
+    ("actuator", "force"): ("ACTUATORFRC", "N m", "N"),
     ("sensor", "position"): ("", "m", "m"),
     ("sensor", "velocity"): ("", "m/s", "m/s"),
     ("sensor", "force"): ("", "N", "N"),
@@ -214,9 +218,6 @@ def _simulator(
         sensors[column] = int(model.sensor_adr[number]) + at
         if m.thing == "joint" and m.kind == "position":
             joints[column] = object_id(model, "joint", m.name)
-            if int(model.jnt_type[joints[column]]) not in (HINGE, SLIDE):
-                raise InputError(f"{file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
-                                 "the seven columns of its body's pose")  # fmt: skip
         if m.thing == "body":
             poses.setdefault(m.name, {})[m.axis] = column
     free = {}
@@ -254,9 +255,14 @@ def _turns(model: Any, m: Mapped) -> bool:
 def _unit(model: Any, m: Mapped) -> str:
     """The SI unit of a column."""
     if m.kind == "command":
-        return "1" if m.unit is None else str(m.unit)
+        what = UNITS.get(known_unit(str(m.unit)) or "", ("number",))[0]
+        if what == "voltage":  # a motor is driven by it as by a duty
+            return "1"
+        return next(name for name, (of, size) in UNITS.items() if of == what and size == 1.0)
     if m.thing in ("body", "site"):
         return "1" if m.axis.startswith("q") else "m"
+    if m.thing == "actuator":
+        return READ[m.thing, m.kind][1 if turns(model, object_id(model, "actuator", m.name)) else 2]
     return READ[m.thing, m.kind][1 if _turns(model, m) else 2]
 
 
@@ -272,7 +278,7 @@ def _check_unit(where: str, m: Mapped, si: str) -> None:
 
 SHORTEST = 1e-6  # limit: s of a solver's step; a second of it would take minutes
 LATITUDE = 0.2  # limit: share of a joint's range by which logs may exceed it
-FULL_TURNS = (-math.tau * 4, math.tau * 4)  # limit: rad; the range of a joint that states none
+FULL_TURNS = (-math.tau * 4, math.tau * 4)  # limit: rad; of a joint without a range or a unit
 
 
 def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, file: str) -> None:
@@ -281,6 +287,8 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
         if m.thing != "joint" or m.kind != "position":
             continue
         joint, low, high = model.joint(m.name).id, np.nanmin(log[column]), np.nanmax(log[column])
+        if m.unit is not None and not model.jnt_limited[joint]:  # such as a wheel's
+            continue
         least, most = (float(v) for v in model.jnt_range[joint]) if model.jnt_limited[joint] else FULL_TURNS
         slack = LATITUDE * (most - least)
         if not (least - slack <= low and high <= most + slack):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hmmseg.errors import InputError, nearest
-from simgap.simulators.mjcf.engine import FREE, HINGE, mujoco
+from simgap.simulators.mjcf.engine import FREE, HINGE, JOINT, mujoco
 
 Put = Callable[[Any, float], None]
 OF_FRICTION = ("load_friction", "direction_friction", "stribeck_extra", "stribeck_speed", "quadratic_drag")
@@ -81,11 +81,25 @@ def follows_rates(model: Any, actuator: int) -> bool:
     return bool(stiff == 0 and gain == -damped and gain > 0)
 
 
+def turns(model: Any, actuator: int) -> bool:
+    """Whether an actuator moves a hinge, so that what it gives is a torque."""
+    moves = int(model.actuator_trnid[actuator, 0])
+    return int(model.actuator_trntype[actuator]) == JOINT and int(model.jnt_type[moves]) == HINGE
+
+
+def strength_of(model: Any, actuator: int) -> slice:
+    """Which of an actuator's numbers its force is proportional to: a motor's first hold something else."""
+    kinds = {"MUSCLE": slice(2, 4), "DCMOTOR": slice(1, 2)}  # its peak force; the motor's constant
+    own = {getattr(mujoco.mjtGain, f"mjGAIN_{kind}", None): at for kind, at in kinds.items()}
+    return own.get(mujoco.mjtGain(model.actuator_gaintype[actuator]), slice(0, 3))
+
+
 def most_of(model: Any, actuator: int) -> float:
     """The largest force of an actuator; 0 where the model states none."""
     if model.actuator_forcelimited[actuator]:
         return float(np.abs(model.actuator_forcerange[actuator]).max())
-    if model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator, 1]:
+    fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+    if fixed and model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator, 1]:
         gain = abs(float(model.actuator_gainprm[actuator, 0]))
         return gain * float(np.abs(model.actuator_ctrlrange[actuator]).max())
     return 0.0
@@ -218,17 +232,20 @@ def _geom(model: Any, name: str, attribute: str) -> Setting | None:
 
 def _actuator(model: Any, name: str, attribute: str) -> Setting | None:
     a, whole = object_id(model, "actuator", name), f"actuator:{name}.{attribute}"
+    force, damped = ("N m", "N m s/rad") if turns(model, a) else ("N", "N s/m")
     if attribute == "gain":  # of a servo of positions its stiffness, of one of rates its velocity gain
-        entries = ("actuator_gainprm", (a, 0)), ("actuator_biasprm", (a, 1 + follows_rates(model, a)))
+        at, muscle = strength_of(model, a), mujoco.mjtBias.mjBIAS_MUSCLE
+        opposed = at if model.actuator_biastype[a] == muscle else 1 + follows_rates(model, a)
+        entries = ("actuator_gainprm", (a, at)), ("actuator_biasprm", (a, opposed))
         return Setting(whole, "1", 0.0, _larger(model, *entries))
-    if attribute == "damping":
+    if attribute == "damping" and model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
         nominal = -float(model.actuator_biasprm[a, 2])
-        return Setting(whole, "N m s/rad", nominal, _to("actuator_biasprm", (a, 2), -1.0))
+        return Setting(whole, damped, nominal, _to("actuator_biasprm", (a, 2), -1.0))
     if attribute == FADE and most_of(model, a):
         return Setting(whole, "1", 0.0, nothing, stored=False)
     if attribute == "limit" and model.actuator_forcelimited[a]:
         ends = _to("actuator_forcerange", a, np.array([-1.0, 1.0]))
-        return Setting(whole, "N", float(model.actuator_forcerange[a, 1]), ends)
+        return Setting(whole, force, float(model.actuator_forcerange[a, 1]), ends)
     return None
 
 
