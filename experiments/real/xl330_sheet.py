@@ -2,9 +2,8 @@
 
     python -m experiments.real.xl330_sheet FOLDER [--diagnose] [--output FILE.json] [--figure FILE.png]
 
-FOLDER has the logs xl330_*.csv; rows with the drive switched off are left out, as the model has no column for
-that. Logs are left out of the fit one by one, and run freely from their first sample. The figure shows one
-that was left out: recorded, by the data sheet, and by the model calibrated on the others.
+FOLDER has the logs xl330_*.csv; rows with the drive switched off are left out. Logs are left out of the fit
+one by one, and run freely from their first sample. The figure shows one of them.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from experiments.golden import rounded
 from experiments.real.xl330 import FULL
 from experiments.saving import save
 from hmmseg.plot.style import BLUE, INK, ORANGE, canvas
@@ -99,12 +97,10 @@ def main() -> None:
             body = found.body() | {"processor": time.process_time() - begun}
             out[what] = body
             before, after = (1e3 * body["heldout"][k]["position"] for k in ("before", "after"))
-            whole = found.composed
-            body["left"] = whole.rows.rms(whole.rows.observed - base_at(whole, found.point).rows)
+            left = found.composed.rows.observed - base_at(found.composed, found.point).rows
+            body["left"] = found.composed.rows.rms(left)
             inside = 1e3 * body["left"]["position"]
-            print(f"{what}: held-out logs {before:.0f} -> {after:.1f} mrad, {body['processor']:.0f} s;"
-                  f" all logs {inside:.1f}")  # fmt: skip
-            print({n: rounded(p["mean"], 3) for n, p in body["parameters"].items()})
+            print(f"{what}: held-out logs {before:.0f} -> {after:.1f} mrad; logs of the fit {inside:.1f}")
         if given.diagnose:
             begun = time.process_time()
             diagnosed = diagnose(loaded.simulator, logs, more=more)
@@ -116,8 +112,7 @@ def main() -> None:
                 "processor": time.process_time() - begun,
             }  # fmt: skip
             print(out["diagnosis"])
-    if given.output:
-        save(given.output, out)
+    save(given.output, out) if given.output else None
 
 
 if __name__ == "__main__":

@@ -363,20 +363,14 @@ def _examined(
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     """Drop causes without which held-out trials are predicted no worse, one at a time.
 
-    The trial that gains most does not count: an accident of one trial is no cause. What residuals say for a
-    random effect must be more than errors in the forms of the others may imitate.
+    The trial that gains most does not count: an accident of one trial is no cause.
     """
-    of = others.whole.gap.candidates
     while causes:
         gained = {}
         for j in causes:
             rest = [i for i in causes if i != j]
             gains = others.gains(causes, rest, rest)
             gained[j] = float(gains.sum() - gains[:-1].max())
-            if rest and not of[j].parameters:
-                feigned = max(of[i].form for i in rest) * others.gain(rest, ())
-                shown = gains.sum() - of[j].evidence
-                gained[j] -= max(shown, 0.0) if shown < feigned else 0.0
         least = min(gained, key=lambda j: gained[j])
         if gained[least] > POSITIVE:
             break

@@ -16,7 +16,7 @@ from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
-from simgap.attribution.posterior import forms
+from simgap.attribution.posterior import Forms, Model, coordinates, forms
 from simgap.attribution.problem import Candidate, Gap
 from simgap.attribution.search import sought, statistic
 from simgap.attribution.verdict import Cell, entries, log_odds, rows
@@ -389,10 +389,10 @@ def attributed(
     """
     gap, models = found.gap, None
     if not forced:
-        models = sought(forms(gap))
-        leading = [c for j in models[0].effects if _shifts_signals(c := gap.candidates[j])]
-        if leading:
-            joint = _together(found, leading)
+        f = forms(gap)
+        models = sought(f)
+        joint = _leading(found, f, models[0])
+        if joint is not None:
             left = scatters(
                 found.problem, found.problem.nuisances.left(joint.residual),
                 [s.effect for s in found.scatters],
@@ -407,9 +407,25 @@ def _shifts_signals(c: Candidate) -> bool:
     return bool(c.parameters) and catalogue()[c.name].correct is not None
 
 
-def _together(found: Search, which: Sequence[Candidate]) -> Fitted:
-    """Fit candidates jointly, from where each was linearised."""
-    u, keys = found.healthy.u.copy(), []
+def _leading(found: Search, f: Forms, best: Model) -> Fitted | None:
+    """Fit the effects of the best set that shift signals jointly; None without any.
+
+    Once from where each fits by itself and once from the mode of the set, as effects that act together may be
+    far from the former; the better fit counts.
+    """
+    alone = {j: c for j in best.effects if _shifts_signals(c := f.gap.candidates[j])}
+    if not alone:
+        return None
+    own, common = coordinates(f, best.effects), found.problem.num_common
+    at_mode = [replace(c, at=c.neutral + c.scale * best.x[own[j]]) for j, c in alone.items()]
+    u = np.append(best.x[:common], found.healthy.u[common:])
+    both = _together(found, [*alone.values()]), _together(found, at_mode, u)
+    return min(both, key=lambda one: one.cost)
+
+
+def _together(found: Search, which: Sequence[Candidate], start: np.ndarray | None = None) -> Fitted:
+    """Fit candidates jointly, from where each was linearised and properties as at the coordinates `start`."""
+    u, keys = (found.healthy.u if start is None else start).copy(), []
     for c in which:
         keys.append(next(key for key in forms_of(c.name) if free_parameters(key) == c.parameters))
         u[columns_of(found.problem, keys[-1:])[found.problem.num_common :]] = c.at

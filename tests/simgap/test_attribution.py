@@ -568,18 +568,3 @@ def test_what_is_known_of_a_random_effect_from_elsewhere_no_form_imitates():
         others = Heldout.of(f, np.ones(3), (0, 4))
         assert others is not None
         assert (4 in _predicting(others, (0, 4))) == kept
-
-
-def test_a_scattering_cause_gains_more_than_the_forms_of_the_others_may_feign():
-    rows = rows_of(samples=40)
-    rng, extra = np.random.default_rng(3), np.where(rows.channel == 1, 8.0, 0.0)
-    column = np.where(rows.channel == 0, 1.0, 0.0)[:, None]
-    nothing = np.zeros(0)
-    noisy = Candidate("noisy", (), nothing, nothing, nothing, np.zeros(extra.size),
-                      np.zeros((extra.size, 0)), nothing, nothing, extra)  # fmt: skip
-    residual = rng.standard_normal(extra.size) * np.sqrt(1 + extra)
-    for size, causes in ((3.0, (0, 1)), (60.0, (0,))):
-        gap = Gap(rows, residual + size * column[:, 0], np.zeros((extra.size, 0)),
-                  (linear("shift", column, 10.0), noisy))  # fmt: skip
-        held = Heldout.of(forms(gap), np.ones(3), (0, 1))
-        assert held is not None and held.gain((0, 1), (0,)) > 100 and _predicting(held, (0, 1)) == causes

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from demo_recordings import RECORDINGS, recorded
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
+from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.problem import cosines
 from simgap.effects import effect_named
+from simgap.gap import diagnose
 from simgap.gap.assemble import gap_of, rows_of, scatters, together
 from simgap.gap.frame import CHANNELS, build
 from simgap.gap.nuisances import with_nuisances
@@ -76,6 +79,26 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
     left = gap.residual - gap.nuisance[:, : given.num_common] @ joint.u[: given.num_common]
     left = left - sum(c.shift for c in gap.candidates)
     np.testing.assert_allclose(left, joint.residual, atol=1e-8)
+
+
+@double_precision
+def test_the_better_of_two_joint_fits_counts(healthy, monkeypatch):
+    given, plain = healthy
+    alone = fit(given, ("force_bias",), neutral(given) + 0.1, steps=0)
+    f = forms(gap_of(given, plain, [alone]))
+    best, starts = fitted(f, (0,)), []
+
+    def recorded_start(_, keys, u):
+        starts.append(u)
+        return replace(alone, effects=keys, u=u, cost=-float(len(starts)))
+
+    monkeypatch.setattr(diagnose, "fit", recorded_start)
+    found = SimpleNamespace(problem=given, healthy=plain)
+    joint, own = diagnose._leading(found, f, best), alone.columns[given.num_common :]
+    assert joint is not None and joint.u is starts[1]
+    np.testing.assert_allclose(starts[0][own], f.gap.candidates[0].at)
+    np.testing.assert_allclose(starts[1][: given.num_common], best.x[: given.num_common])
+    assert np.abs(starts[1][own]).max() < 0.05  # a healthy hand's
 
 
 @double_precision
