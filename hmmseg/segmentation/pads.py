@@ -243,7 +243,7 @@ class Sensing:
     `delay` [s] of the forces (negative: they lead) and its sd `delay_sd`. If it is the sensor's (`late`),
     forces must be read `delay` later or, for a `filter`, unfiltered. `friction`: largest ratio of shear to
     grip force observed on one pad as it lets go. `rests` [m]: residuals of the heights of resting blocks,
-    given their loads.
+    given their loads, and the `noise` of heights [m] and loads [N].
     """
 
     normal: Compliance
@@ -254,6 +254,7 @@ class Sensing:
     filter: bool = False
     friction: float = np.inf
     rests: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    noise: tuple[float, float] = (SLOWEST_SD, 0.0)
 
     @property
     def pads(self) -> Pads:
@@ -261,10 +262,16 @@ class Sensing:
         return Pads(self.normal.value, self.normal.value, self.shear.value, self.shear.value)
 
     def heights_gain(self, other: Sensing) -> float:
-        """Log-likelihood gain [nats] of the heights of resting blocks over another reading of the forces."""
+        """Log-likelihood gain [nats] of the heights of resting blocks over another reading of the forces.
+
+        Misfits count relative to their expected noise, since forces without their filter are louder.
+        """
         if not (self.rests.size and other.rests.size):
             return np.inf
-        return DEPENDENT * self.rests.size * float(np.log(robust_sd(other.rests) / robust_sd(self.rests)))
+        own, others = (
+            robust_sd(s.rests) / np.hypot(s.noise[0], self.shear.value * s.noise[1]) for s in (self, other)
+        )
+        return DEPENDENT * self.rests.size * float(np.log(others / own))
 
     def remarks(self, rig: Rig) -> tuple[str, ...]:
         """Contradictions between recording and rig, for people."""
@@ -299,14 +306,14 @@ def read_again(s: Signals, sensing: Sensing) -> Signals:
 def _unfiltered(t: np.ndarray, force: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
     """Forces [N] without their first-order filter of this time `constant` [s], and the noise gain.
 
-    (F_n - k F_(n-1)) / (1 - k), where k is the share kept over a sample interval h, is a steady input, or a
-    steadily changing one at a time constant - h k / (1 - k) earlier: h / 2 for slow filters.
+    (F(t) - k F(t - span)) / (1 - k), where k is the share kept over the span, is a mean input over the span,
+    or a steadily changing one at a time constant - span k / (1 - k) earlier. From sample to sample, noise of
+    fast recordings would be many times louder; a span that keeps half makes it sqrt(5) times louder at most.
     """
-    step = np.diff(t)
-    kept = np.exp(-step / constant)
-    read = np.r_[force[:1], (force[1:] - kept * force[:-1]) / (1 - kept)]
-    ago = np.r_[0.0, constant - step * kept / (1 - kept)]
-    louder = float(np.median(np.sqrt(1 + kept**2) / (1 - kept)))
+    span = max(float(np.median(np.diff(t))), np.log(2) * constant)
+    kept = np.exp(-span / constant)
+    read = (force - kept * np.interp(t - span, t, force)) / (1 - kept)
+    ago, louder = constant - span * kept / (1 - kept), float(np.sqrt(1 + kept**2) / (1 - kept))
     return resampled(t, t - ago, read), louder
 
 
@@ -373,7 +380,9 @@ def sense(
         place + shear.value * load for load, place in (reading(s, lead) for s in loads) if load.size > 3
     ]
     rests = np.concatenate([np.zeros(0), *(height - np.median(height) for height in heights)])
-    return Sensing(normal, shear, timing.delay, doubt, timing.late, timing.filter, friction, rests)
+    noise = (float(np.median([own.sd for own in loads] or [SLOWEST_SD])),
+             float(np.median([parameters.force_sd(s) for s in signals] or [0.0]) / np.sqrt(2)))  # fmt: skip
+    return Sensing(normal, shear, timing.delay, doubt, timing.late, timing.filter, friction, rests, noise)
 
 
 def _prior(compliance: float, stated: float) -> tuple[float, float]:

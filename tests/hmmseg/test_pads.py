@@ -1,5 +1,7 @@
 """Pads and delays are learned from what rests: planted ones are found and told apart, none invented."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -222,8 +224,23 @@ def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
     filtered = np.interp(t, fine, lfilter([1 - kept], [1, -kept], force))
     undone, louder = _unfiltered(t, filtered, 0.03)
     np.testing.assert_allclose(undone, np.interp(t, fine, force), atol=0.15)
-    assert louder == pytest.approx(np.sqrt(1 + np.exp(-4 / 3)) / (1 - np.exp(-2 / 3)), rel=1e-6)
+    assert louder == pytest.approx(np.sqrt(5))
     assert np.abs(undone[t < 0.31]).max() < 0.02
+
+
+@pytest.mark.parametrize("step", [0.05, 0.01, 0.002])
+def test_unfiltering_makes_noise_little_louder_at_any_rate(step):
+    t = np.arange(0, 40, step)
+    noise, louder = _unfiltered(t, np.random.default_rng(0).standard_normal(t.size), 0.03)
+    assert louder < 2.24 and np.nanstd(noise) < 2.24  # 21 at 500 Hz from sample to sample
+
+
+def test_heights_are_not_held_against_forces_for_being_louder():
+    pad, white = Compliance(5e-4, 1e-6, 0.05), np.random.default_rng(0).standard_normal(200)
+    late = Sensing(pad, pad, 0.03, 0.003, True, True, rests=2.2e-5 * white, noise=(1.5e-5, 0.01))
+    loud = Sensing(pad, pad, 0.0, 0.003, rests=2.5e-5 * white, noise=(1.5e-5, 0.04))
+    assert loud.heights_gain(late) > 10 and late.heights_gain(loud) < -10
+    assert replace(loud, rests=5e-5 * white).heights_gain(late) < -10  # no noise explains that
 
 
 SD = 2e-5
