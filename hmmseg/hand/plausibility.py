@@ -286,12 +286,14 @@ class Holds:
         pressed: samples (num_timesteps,) of all holds.
         height: (num_timesteps,) [m] above the first sample of the hold.
         before: samples (num_timesteps,) before the first touch.
+        free: samples (num_timesteps,) of at most a light touch.
         rises: for each hold in which the hand moves, whether it goes up first.
     """
 
     pressed: np.ndarray
     height: np.ndarray
     before: np.ndarray
+    free: np.ndarray
     rises: tuple[bool, ...]
 
 
@@ -314,7 +316,7 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     apart, towards = _agreed(s.distance[holds.pressed]), _agreed(squeeze[holds.pressed])
     lifts = holds.pressed & (holds.height > LIFTED)
     idle = float(np.median(load[holds.before])) if holds.before.sum() >= BRIEF else 0.0
-    carried = _agreed(load[lifts] - idle, MOST) if lifts.sum() >= BRIEF else 0
+    carried = _agreed((load - _zero(load, holds.free))[lifts], MOST) if lifts.sum() >= BRIEF else 0
     first, second = (float(np.median(f[lifts])) if lifts.sum() >= BRIEF else 0.0 for f in (s.fy1, s.fy2))
     found = _sides(apart, towards, carried, first * second > 0, trial, rig)
     found = found or _one_bears(first, second, idle, rig)
@@ -399,8 +401,15 @@ def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
             rises += [bool(moved[0] > 0)] if moved.size else []
     if not kept.any():
         return None
-    touched = int(np.flatnonzero(np.abs(squeeze) > scale / 10)[0])
-    return Holds(kept, height, np.arange(y.size) < touched, tuple(rises))
+    free = np.abs(squeeze) <= scale / 10
+    return Holds(kept, height, np.logical_and.accumulate(free), free, tuple(rises))
+
+
+def _zero(load: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """The load [N] that the sensors read of nothing (num_timesteps,), between free stretches on a line: zeros
+    drift, and a light block's weight is soon exceeded."""
+    each = [((i + j) / 2, np.median(load[i:j])) for i, j in runs(free) if j - i >= BRIEF]
+    return np.interp(np.arange(load.size), *np.transpose(each)) if each else np.zeros(load.size)
 
 
 def _pushing_alike(common: np.ndarray, squeeze: np.ndarray, load: np.ndarray) -> int | None:

@@ -122,6 +122,14 @@ def test_a_position_that_repeats_itself_exchanges_no_axes():
     assert any("x1 reads 0.1 in every row" in line for line in trial.warnings)
 
 
+def test_a_zero_that_drifts_by_more_than_a_block_weighs_flips_no_sign():
+    drift = np.linspace(0, -3, JOINT["t"].size)
+    read_trial({**JOINT, "fy1": JOINT["fy1"] + drift, "fy2": JOINT["fy2"] + drift}, JOINTED)
+    flipped = {**JOINT, "fy1": -JOINT["fy1"] - drift, "fy2": -JOINT["fy2"] - drift}
+    with pytest.raises(InputError, match="negative in sum while a block is lifted"):
+        read_trial(flipped, JOINTED)
+
+
 def test_positions_in_coarse_steps_are_told_and_not_taken_for_stuck():
     rounded = {name: np.round(values, 3) if name[0] in "xy" else values for name, values in CARTESIAN.items()}
     trial = read_trial(rounded, parse_rig({"noise": {"position": 2e-5}}))
