@@ -99,8 +99,7 @@ def main() -> None:
             before, after = (1e3 * body["heldout"][k]["position"] for k in ("before", "after"))
             left = found.composed.rows.observed - base_at(found.composed, found.point).rows
             body["left"] = found.composed.rows.rms(left)
-            inside = 1e3 * body["left"]["position"]
-            print(f"{what}: held-out logs {before:.0f} -> {after:.1f} mrad; logs of the fit {inside:.1f}")
+            print(f"{what}: held-out logs {before:.0f} -> {after:.1f} mrad; logs of the fit: {body['left']}")
         if given.diagnose:
             begun = time.process_time()
             diagnosed = diagnose(loaded.simulator, logs, more=more)
@@ -112,7 +111,8 @@ def main() -> None:
                 "processor": time.process_time() - begun,
             }  # fmt: skip
             print(out["diagnosis"])
-    save(given.output, out) if given.output else None
+    if given.output:
+        save(given.output, out)
 
 
 if __name__ == "__main__":

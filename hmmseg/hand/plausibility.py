@@ -285,14 +285,12 @@ class Holds:
     Attributes:
         pressed: samples (num_timesteps,) of all holds.
         height: (num_timesteps,) [m] above the first sample of the hold.
-        before: samples (num_timesteps,) before the first touch.
         free: samples (num_timesteps,) of at most a light touch.
         rises: for each hold in which the hand moves, whether it goes up first.
     """
 
     pressed: np.ndarray
     height: np.ndarray
-    before: np.ndarray
     free: np.ndarray
     rises: tuple[bool, ...]
 
@@ -315,8 +313,9 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
         return []
     apart, towards = _agreed(s.distance[holds.pressed]), _agreed(squeeze[holds.pressed])
     lifts = holds.pressed & (holds.height > LIFTED)
-    idle = float(np.median(load[holds.before])) if holds.before.sum() >= BRIEF else 0.0
-    carried = _agreed((load - _zero(load, holds.free))[lifts], MOST) if lifts.sum() >= BRIEF else 0
+    zero = _zero(load, holds.free)
+    idle, added = float(zero[0]), (load - zero)[lifts]
+    carried = _agreed(added, MOST) if lifts.sum() >= BRIEF else 0
     first, second = (float(np.median(f[lifts])) if lifts.sum() >= BRIEF else 0.0 for f in (s.fy1, s.fy2))
     found = _sides(apart, towards, carried, first * second > 0, trial, rig)
     found = found or _one_bears(first, second, idle, rig)
@@ -324,7 +323,7 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     if found or lifts.sum() < BRIEF:
         return found
     grip = float(np.median(np.abs(squeeze[holds.pressed])))
-    return _own_weight(idle, float(np.median(load[lifts])) - idle, grip, rig)
+    return _own_weight(idle, float(np.median(added)), grip, rig)
 
 
 def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial, rig: Rig) -> list[Finding]:
@@ -401,8 +400,7 @@ def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
             rises += [bool(moved[0] > 0)] if moved.size else []
     if not kept.any():
         return None
-    free = np.abs(squeeze) <= scale / 10
-    return Holds(kept, height, np.logical_and.accumulate(free), free, tuple(rises))
+    return Holds(kept, height, np.abs(squeeze) <= scale / 10, tuple(rises))
 
 
 def _zero(load: np.ndarray, free: np.ndarray) -> np.ndarray:

@@ -192,7 +192,7 @@ def attribute(
     forced: tuple[str, ...] = (),
     seed: int = 0,
     heldout: bool = True,
-    models: list[Model] | None = None,
+    searched: tuple[Forms, list[Model]] | None = None,
     absorbed: np.ndarray | None = None,
 ) -> Attribution:
     """Attribute a gap to its candidates.
@@ -204,15 +204,15 @@ def attribute(
         forced: Effects that act for certain; no others do.
         seed: Of the draws behind intervals.
         heldout: Whether causes must shrink the gap of held-out trials, if there are several trials.
-        models: Result of `sought`, if known.
+        searched: The gap's quadratic forms and the result of `sought`, if known.
         absorbed: Shifts of the first nuisances that do not matter; None if any may be.
 
     Raises:
         InputError: A forced effect is not among the candidates.
     """
     rng = np.random.default_rng(seed)
-    f = forms(gap)
-    models = sought(f) if models is None else models
+    f = forms(gap) if searched is None else searched[0]
+    models = sought(f) if searched is None else searched[1]
     if forced:
         models = [_forced(f, forced), *[m for m in models if not m.effects]]
     value = statistic(f, models)

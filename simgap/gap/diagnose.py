@@ -387,19 +387,19 @@ def attributed(
         seed: Of the draws behind intervals.
         healthy: Statistics of healthy recordings, drawn if there is an alarm.
     """
-    gap, models = found.gap, None
+    gap, searched = found.gap, None
     if not forced:
         f = forms(gap)
-        models = sought(f)
-        joint = _leading(found, f, models[0])
+        searched = f, sought(f)
+        joint = _leading(found, f, searched[1][0])
         if joint is not None:
             left = scatters(
                 found.problem, found.problem.nuisances.left(joint.residual),
                 [s.effect for s in found.scatters],
             )  # fmt: skip
-            gap, models = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
+            gap, searched = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
-    return gap, attribute(gap, healthy, forced, seed, models=models, absorbed=absorbed)
+    return gap, attribute(gap, healthy, forced, seed, searched=searched, absorbed=absorbed)
 
 
 def _shifts_signals(c: Candidate) -> bool:
@@ -410,12 +410,12 @@ def _shifts_signals(c: Candidate) -> bool:
 def _leading(found: Search, f: Forms, best: Model) -> Fitted | None:
     """Fit the effects of the best set that shift signals jointly; None without any.
 
-    Once from where each fits by itself and once from the mode of the set, as effects that act together may be
-    far from the former; the better fit counts.
+    Several are fitted once from where each fits by itself and once from the mode of the set, as effects that
+    act together may be far from the former; the better fit counts.
     """
     alone = {j: c for j in best.effects if _shifts_signals(c := f.gap.candidates[j])}
-    if not alone:
-        return None
+    if len(alone) < 2:
+        return _together(found, [*alone.values()]) if alone else None
     own, common = coordinates(f, best.effects), found.problem.num_common
     at_mode = [replace(c, at=c.neutral + c.scale * best.x[own[j]]) for j, c in alone.items()]
     u = np.append(best.x[:common], found.healthy.u[common:])

@@ -94,17 +94,18 @@ def diagnose(
     given = scene(lay, find_ring(lay))
     tell("fitting effects")
     white, gap = fitted_gap(given, real, sim)
-    models = None
+    searched = None
     if not forced:
-        models = sought(forms(gap))
-        leading = tuple(gap.candidates[j].name for j in models[0].effects)
+        f = forms(gap)
+        searched = f, sought(f)
+        leading = tuple(gap.candidates[j].name for j in searched[1][0].effects)
         if len(leading) > 1:
             together = _joint(given, white, fit(given, white, real, sim, leading), len(real))
-            gap, models = replace(gap, candidates=(*gap.candidates, *together)), None
+            gap, searched = replace(gap, candidates=(*gap.candidates, *together)), None
     tell("attributing the gap")
 
     exchanged = _exchanged(given, real, sim, seed)
-    verdict = attribute(gap, exchanged, tuple(dict.fromkeys(forced)), seed, models=models)
+    verdict = attribute(gap, exchanged, tuple(dict.fromkeys(forced)), seed, searched=searched)
     return _document(given, gap, white, verdict, real, sim)
 
 

@@ -84,9 +84,9 @@ def test_a_joint_fit_is_the_sum_of_its_parts_where_it_was_linearised(healthy):
 @double_precision
 def test_the_better_of_two_joint_fits_counts(healthy, monkeypatch):
     given, plain = healthy
-    alone = fit(given, ("force_bias",), neutral(given) + 0.1, steps=0)
-    f = forms(gap_of(given, plain, [alone]))
-    best, starts = fitted(f, (0,)), []
+    alone, tilted = (fit(given, (e,), neutral(given) + 0.1, steps=0) for e in ("force_bias", "table_tilt"))
+    f = forms(gap_of(given, plain, [alone, tilted]))
+    best, starts = fitted(f, (0, 1)), []
 
     def recorded_start(_, keys, u):
         starts.append(u)
