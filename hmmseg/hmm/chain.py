@@ -36,12 +36,12 @@ class Leaves:
     def __init_subclass__(cls) -> None:
         register_pytree_node_class(cls)
 
-    def tree_flatten(self) -> tuple[tuple, None]:
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
         """The leaves, for JAX."""
         return tuple(getattr(self, name) for name in self.leaves), None
 
     @classmethod
-    def tree_unflatten(cls: type[Tree], _: None, leaves: tuple) -> Tree:
+    def tree_unflatten(cls: type[Tree], _: None, leaves: tuple[Any, ...]) -> Tree:
         """An instance with these leaves, which may be any JAX values."""
         tree = object.__new__(cls)
         vars(tree).update(zip(cls.leaves, leaves, strict=True))
@@ -77,7 +77,7 @@ class Chain(Leaves):
         log_initial: ArrayLike | None = None,
         log_final: ArrayLike | None = None,
     ) -> None:
-        skips: tuple = ()
+        skips: tuple[Any, ...] = ()
         if log_skip is not None:
             whole = isinstance(log_skip, (np.ndarray, jax.Array))
             skips = (log_skip,) if whole else tuple(log_skip)  # type: ignore[arg-type]

@@ -217,7 +217,7 @@ def rank(x: Array, chain: DurationChain, n: Array, count: int) -> tuple[Array, A
     (num_states, longest), states = chain.pmf.shape, numbers(x.shape[1])
     entered = jnp.full((num_states, count), NEVER).at[:, 0].set(chain.log_initial)
 
-    def step(t: Array, carry: tuple) -> tuple:
+    def step(t: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
         entered, window, lasted, came, _ = carry
         window = (
             jnp.concatenate([entered[:, None], window[:, :-1]], axis=1) + known(row(x, t - 1))[:, None, None]

@@ -31,6 +31,7 @@ from hmmseg.hmm.durations import DurationChain
 from hmmseg.hmm.results import Alignment, AlignmentPosterior, Alignments, Filtered, Posterior
 
 AnyChain = Chain | DurationChain
+Core = Callable[..., Any]
 SHORTEST = 128  # numerics: samples; the first step of the ladder of lengths
 TOGETHER = 64  # numerics: recordings of one shape per call; the remainder is processed one by one
 MAX_RANKS = 65_535  # limit: of k_best
@@ -123,7 +124,7 @@ def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int, length: Any = No
 # finite for an answer to exist, and the answer.
 
 
-def _solver(chain: Any) -> tuple[Any, tuple]:
+def _solver(chain: Any) -> tuple[Any, tuple[Any, ...]]:
     """The module of a chain's recursions, and its weights as their arguments."""
     if isinstance(chain, DurationChain):
         return durations, (chain,)
@@ -206,7 +207,7 @@ def _k_best(x: jax.Array, chain: Any, n: jax.Array, k: int,
     return log_prob[0], Alignments(starts, jnp.full(k, n), log_prob)
 
 
-def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, tuple]:
+def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, tuple[Any, ...]]:
     total, posterior = _smooth(x, chain, n, parallel)
     return total, (_viterbi(x, chain, n, parallel)[1], posterior)
 
@@ -214,8 +215,8 @@ def _align(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tup
 # How the cores are called.
 
 
-def _run(core: Callable, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,
-         inside: Callable | None = None, parallel: bool | None, **static: Any) -> Any:  # fmt: skip
+def _run(core: Core, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,
+         inside: Core | None = None, parallel: bool | None, **static: Any) -> Any:  # fmt: skip
     """Run a core on one recording: inline if anything is traced, else compiled, returning NumPy arrays."""
     leaves = jax.tree.leaves((log_likelihoods, chain, length, keys))
     if not any(isinstance(leaf, Tracer) for leaf in leaves):
@@ -252,7 +253,7 @@ def _failure(x: np.ndarray, chain: AnyChain) -> ValueError:
     """The exception for a recording without a finite log weight."""
     if np.isposinf(x).any():
         return not_a_number("log_likelihoods", np.isposinf(x))
-    why: Callable = durations.why_infeasible if isinstance(chain, DurationChain) else why_infeasible
+    why: Core = durations.why_infeasible if isinstance(chain, DurationChain) else why_infeasible
     return why(x, chain)
 
 
@@ -274,8 +275,9 @@ def _checked_length(length: int, num_samples: int, recording: str = "") -> int:
     return length
 
 
-def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
-               lengths: Sequence[int] | np.ndarray | None) -> tuple[list, list]:  # fmt: skip
+def recordings(
+    log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain], lengths: Sequence[int] | np.ndarray | None
+) -> tuple[list[np.ndarray], list[AnyChain]]:
     """Checked tables and chains of several recordings."""
     tables = list(log_likelihoods)
     if lengths is not None:
@@ -291,8 +293,8 @@ def recordings(log_likelihoods: Any, chain: AnyChain | Sequence[AnyChain],
     return [checked(ll, c) for ll, c in zip(tables, chains, strict=True)], chains
 
 
-def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any], *keys: Any,
-             parallel: bool | None = None, **static: Any) -> list:  # fmt: skip
+def run_many(core: Core, tables: Sequence[np.ndarray], chains: Sequence[Any], *keys: Any,
+             parallel: bool | None = None, **static: Any) -> list[Any]:  # fmt: skip
     """Run a core on checked recordings, each padded to the ladder: one program per shape.
 
     Raises InfeasibleAlignment, and ValueError for +inf.
@@ -327,12 +329,12 @@ def run_many(core: Callable, tables: Sequence[np.ndarray], chains: Sequence[Any]
 
 
 @cache
-def compiled(core: Callable, parallel: bool, static: tuple) -> Callable:
+def compiled(core: Core, parallel: bool, static: tuple[tuple[str, Any], ...]) -> Core:
     """The core for several recordings as one program."""
     kws = dict(static, parallel=parallel)
 
     def run(x: jax.Array, chain: Any, n: jax.Array, *keys: jax.Array) -> Any:
-        def one(args: tuple) -> Any:
+        def one(args: tuple[Any, ...]) -> Any:
             return core(*args, *keys, **kws)
 
         return jax.vmap(one)((x, chain, n)) if parallel else jax.lax.map(one, (x, chain, n))

@@ -116,7 +116,7 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Operation,
     def by_row(x: Array, w: Array, initial: Array, n: Array) -> tuple[Array, Array]:
         table = jnp.full(x.shape, NEVER).at[0].set(initial + known(x[0]))
 
-        def step(t: Array, carry: tuple) -> tuple:
+        def step(t: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
             table, *taken = carry
             before, weight = row(table, t - 1), row(w, t - 1)
             now = reduce(plus, [forwards(before, d) + weight[d] for d in range(w.shape[1])]) + known(
@@ -127,9 +127,9 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Operation,
                 now, taken = now - top, [taken[0] + top]
             return lax.dynamic_update_index_in_dim(table, now, t, 0), *taken
 
-        start: tuple = (table, jnp.zeros(())) if plus is log_add else (table,)
+        start = (table, jnp.zeros(())) if plus is log_add else (table,)
         found = lax.fori_loop(jnp.int32(1), n, step, start) if len(x) > 1 else start
-        return found[0], (found[1] if plus is log_add else jnp.zeros(()))
+        return found[0], (found[-1] if plus is log_add else jnp.zeros(()))
 
     def by_state(x: Array, w: Array, initial: Array, n: Array) -> tuple[Array, Array]:
         x = known(x)
@@ -241,7 +241,7 @@ def trace_back(table: Array, w: Array, k: Array, n: Array, block: int) -> Array:
     return lax.while_loop(lambda carry: (carry[0] > 0) & (carry[1] > 0), look, start)[2]
 
 
-def one_by_one(function: Callable) -> Callable:
+def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a function so that vmap runs recordings in turn on a CPU, which keeps each in its cache.
 
     The rule may be applied after tracing, outside the double-precision setting under which that was done.

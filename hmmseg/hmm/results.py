@@ -100,7 +100,7 @@ class Posterior:
 
     log_evidence: Any
     smoothed: Any
-    moves: tuple
+    moves: tuple[Any, ...]
 
     @property
     def boundary(self) -> Any:

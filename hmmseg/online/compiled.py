@@ -60,7 +60,7 @@ class _Kept(IndexDataCacheFile):
         keep(Path(self._data_path(name)), self._dump(data))
 
 
-def compiled(function: Callable) -> Any:
+def compiled(function: Callable[..., Any]) -> Any:
     """Compile `function` at its first call, without the interpreter's lock."""
     function = inspect.unwrap(function)  # annotation checkers wrap every function in tests
     made: Any = numba.njit(function, cache=CACHED, **OPTIONS)
@@ -70,7 +70,7 @@ def compiled(function: Callable) -> Any:
     return made
 
 
-def _for_numbers(function: Callable) -> None:
+def _for_numbers(function: Callable[..., Any]) -> None:
     """Let compiled functions call, for single numbers, functions that other packages apply to arrays."""
     plain = inspect.unwrap(function)
     options: Any = OPTIONS

@@ -20,6 +20,7 @@ from hmmseg.online.hypothesis import (
     GROUND_KIND,
     NUM_RING,
     SLIDING_KIND,
+    Record,
     free,
     held,
     learn,
@@ -59,14 +60,14 @@ class Chain(NamedTuple):
 
 
 @compiled
-def _settled(age):
+def _settled(age: float) -> float:
     """Probability that a contact has settled: Erlang, STAGES stages, SETTLING s on average."""
     z = age * STAGES / SETTLING
     return -math.expm1(-z) - math.exp(-z) * (z + z * z / 2)
 
 
 @compiled
-def _copy(into, i, other, j):
+def _copy(into: Table, i: int, other: Table, j: int) -> None:
     """Overwrite hypothesis i of a table by hypothesis j of another."""
     into.rows[i] = other.rows[j]
     for q in range(into.known.shape[1]):
@@ -74,7 +75,7 @@ def _copy(into, i, other, j):
 
 
 @compiled
-def _average(one, other, a, b):
+def _average(one: np.ndarray, other: np.ndarray, a: float, b: float) -> None:
     """Evidence (n, 2) of a mixture."""
     for k in range(one.shape[0]):
         one[k, 0] = a * one[k, 0] + b * other[k, 0]
@@ -82,7 +83,7 @@ def _average(one, other, a, b):
 
 
 @compiled
-def _mix(one, other, a, b):
+def _mix(one: np.ndarray, other: np.ndarray, a: float, b: float) -> None:
     """Mean and variance (2,) of a mixture."""
     gap = one[0] - other[0]
     one[1] = a * one[1] + b * other[1] + a * b * gap * gap
@@ -90,7 +91,7 @@ def _mix(one, other, a, b):
 
 
 @compiled
-def absorb(into, i, other, j):
+def absorb(into: Table, i: int, other: Table, j: int) -> None:
     """Merge hypothesis j of `other` into i of `into`, of the same state, by moments; their weights add."""
     h, g = into.rows[i], other.rows[j]
     total = log_sum(h.weight, g.weight)
@@ -109,7 +110,9 @@ def absorb(into, i, other, j):
 
 
 @compiled
-def _enter(h, known, t, half, chain, before, after):
+def _enter(
+    h: Record, known: np.ndarray, t: float, half: float, chain: Chain, before: int, after: int
+) -> bool:
     """Move a hypothesis from state `before` to `after`; returns whether its block rose the wrong way."""
     kinds = chain.kinds
     h.state = after
@@ -135,7 +138,7 @@ def _enter(h, known, t, half, chain, before, after):
 
 
 @compiled
-def _add(table, count, fresh, j):
+def _add(table: Table, count: int, fresh: Table, j: int) -> int:
     """Append a hypothesis, or merge it into one of its state that was entered at the same time.
 
     The last row of a table stays free: it is the workspace of those who write hypotheses.
@@ -152,7 +155,7 @@ def _add(table, count, fresh, j):
 
 
 @compiled
-def _advance(table, count, fresh, t, dt, chain):
+def _advance(table: Table, count: int, fresh: Table, t: float, dt: float, chain: Chain) -> int:
     """Let hypotheses move on to the task's next state, in part."""
     num_new, half, away = 0, dt / 2, -math.expm1(-dt / PACE)
     for i in range(count):
@@ -180,7 +183,7 @@ def _advance(table, count, fresh, t, dt, chain):
 
 
 @compiled
-def _may_follow(chain, before, after):
+def _may_follow(chain: Chain, before: int, after: int) -> bool:
     """Whether one contact state may follow another: a hand changes blocks only through free motion."""
     kinds, blocks = chain.kinds, chain.blocks
     same = blocks[before] == blocks[after]
@@ -190,7 +193,7 @@ def _may_follow(chain, before, after):
 
 
 @compiled
-def _depart(table, count, fresh, t, dt, chain):
+def _depart(table: Table, count: int, fresh: Table, t: float, dt: float, chain: Chain) -> int:
     """Let hypotheses leave the task, or change state off the task, in part."""
     num_steps, num_states = chain.num_steps, chain.kinds.size
     log_away = math.log(-math.expm1(-dt / PACE))
@@ -223,7 +226,7 @@ def _depart(table, count, fresh, t, dt, chain):
 
 
 @compiled
-def _thin(table, count, state, most, t):
+def _thin(table: Table, count: int, state: int, most: int, t: float) -> int:
     """Merge the most similar hypotheses of one state until `most` are left."""
     rows = table.rows
     while True:
@@ -256,7 +259,9 @@ def _thin(table, count, state, most, t):
 
 
 @compiled
-def _explained(h, known, x, chain, span, pads, gravity):
+def _explained(
+    h: Record, known: np.ndarray, x: Record, chain: Chain, span: Record, pads: Pads, gravity: float
+) -> float:
     """Log-likelihood of a reading in the hypothesis's own state, ringing while the contact settles."""
     kind, block, blocks = chain.kinds[h.state], chain.blocks[h.state], chain.num_blocks
     if kind == FREE_KIND:
@@ -277,8 +282,12 @@ def _explained(h, known, x, chain, span, pads, gravity):
 
 
 @compiled
-def advance(rows, known, fresh_rows, fresh_known, count, reading, dt, since, share, states, signs, num_steps,
-            num_blocks, num_rounds, ranges, compliances, gravity):  # fmt: skip
+def advance(
+    rows: np.ndarray, known: np.ndarray, fresh_rows: np.ndarray, fresh_known: np.ndarray, count: int,
+    reading: np.ndarray, dt: float, since: float, share: float, states: np.ndarray, signs: np.ndarray,
+    num_steps: int, num_blocks: int, num_rounds: int, ranges: np.ndarray, compliances: np.ndarray,
+    gravity: float
+) -> int:  # fmt: skip
     """Process one reading; returns the number of hypotheses afterwards.
 
     `rows`, `known`: the table, and a few hypotheses as workspace; `dt` [s] since the previous reading,
@@ -315,7 +324,7 @@ def advance(rows, known, fresh_rows, fresh_known, count, reading, dt, since, sha
 
 
 @compiled
-def _state_at(h, t, num_steps):
+def _state_at(h: Record, t: float, num_steps: int) -> int:
     """State of the task at an earlier time t; -1: off the task."""
     state = h.state
     if state >= num_steps:
@@ -330,7 +339,10 @@ def _state_at(h, t, num_steps):
 
 
 @compiled
-def summarise(rows, known, count, num_steps, num_blocks, before, now, smoothed, means):
+def summarise(
+    rows: np.ndarray, known: np.ndarray, count: int, num_steps: int, num_blocks: int, before: float,
+    now: np.ndarray, smoothed: np.ndarray, means: np.ndarray
+) -> tuple[int, int]:  # fmt: skip
     """Indices of the heaviest hypothesis on the task and off it, -1 if there is none.
 
     Fills `now`, `smoothed` (num_steps + 1,): probability of each subtask, and last of a departure, at the
@@ -374,7 +386,9 @@ def summarise(rows, known, count, num_steps, num_blocks, before, now, smoothed, 
 
 
 @compiled
-def boundary(rows, count, num_steps, number, before):
+def boundary(
+    rows: np.ndarray, count: int, num_steps: int, number: int, before: float
+) -> tuple[float, float, float, float]:
     """Mean and variance of crossing `number` (from 0), and the probabilities of it, and of it by `before`.
 
     All given that the recording follows its task, as nothing off the task is a boundary of it.

@@ -19,10 +19,11 @@ row.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
-from hmmseg.contact.equations import block_width, block_y, inertia_factor
+from hmmseg.contact.equations import Pads, block_width, block_y, inertia_factor
 from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.online.compiled import compiled
@@ -57,12 +58,17 @@ RANGES = np.dtype([(name, "f8") for name in ("vx", "vy", "y", "d", "force", "pre
 # A row kept for averages: reach of the joints' noise (x, y); forces, vx, vy, y and d; mean net fy.
 ROW = np.dtype([("t", "f8"), ("reach", "f8", 2), ("value", "f8", 8), ("fy", "f8")])
 
+Record = Any  # one element of such an array: numba gives it attributes, NumPy's types do not
+
 SLOPE = 1.0 / MAX_RATE
 ROWS = 512  # numerics: most rows kept: 20 kHz over SLOPE
 
 
 @compiled
-def read(rows, head, filled, t, dt, channels, jointed, geometry, measured, before, noise, out):
+def read(
+    rows: np.ndarray, head: int, filled: int, t: float, dt: float, channels: np.ndarray, jointed: bool,
+    geometry: np.ndarray, measured: bool, before: np.ndarray, noise: np.ndarray, out: np.ndarray
+) -> None:  # fmt: skip
     """Add a row to the ring and fill `out` with the reading at `t` [s].
 
     `rows` (ROWS,): ring whose newest row goes to `head`, with `filled` rows; `dt` [s] since the previous row,
@@ -136,7 +142,7 @@ def read(rows, head, filled, t, dt, channels, jointed, geometry, measured, befor
 
 
 @compiled
-def _mean(rows, head, number, k):
+def _mean(rows: np.ndarray, head: int, number: int, k: int) -> float:
     """Mean of a value over the last rows, NaN if missing in all of them."""
     total, num = 0.0, 0
     for back in range(number):
@@ -148,7 +154,7 @@ def _mean(rows, head, number, k):
 
 
 @compiled
-def widen(extremes, ranges, least, x):
+def widen(extremes: np.ndarray, ranges: np.ndarray, least: np.ndarray, x: Any) -> None:
     """Extend the ranges of the emissions by a reading; they stay above `least` (4,)."""
     span, x = ranges[0], x[0]
     for k, value in enumerate((x.vx, x.vy, x.y, x.d)):
@@ -176,14 +182,14 @@ _ROOT2 = math.sqrt(2.0)  # numerics: computed once
 
 
 @compiled
-def log_sum(a, b):
+def log_sum(a: float, b: float) -> float:
     """log(exp(a) + exp(b))."""
     high, low = (a, b) if a > b else (b, a)
     return high + math.log1p(math.exp(low - high)) if low > -math.inf else high
 
 
 @compiled
-def _log_rising(value, scale, span):
+def _log_rising(value: float, scale: float, span: float) -> float:
     """Log density of value = w + noise (sd `scale`), with w of a density that rises from 0 to `span`.
 
     The integral of 2 w / span^2 times the normal density over w > 0 is
@@ -196,31 +202,31 @@ def _log_rising(value, scale, span):
 
 
 @compiled
-def _log_broad(value, span):
+def _log_broad(value: float, span: float) -> float:
     """Log density of a value uniform over `span`; 0 where missing."""
     return 0.0 if math.isnan(value) else -math.log(span)
 
 
 @compiled
-def _force(h, x, c):
+def _force(h: Record, x: Record, c: int) -> float:
     """One force without its bias [N]."""
     return x.force[c] - h.bias[c, 0] / h.bias[c, 1]
 
 
 @compiled
-def _square(h, which):
+def _square(h: Record, which: int) -> float:
     """Squared scale of one kind of residual."""
     return h.scale[which, 0] / h.scale[which, 1]
 
 
 @compiled
-def _carry(h, x):
+def _carry(h: Record, x: Record) -> float:
     """Variance of the net vertical force of a carried block [N^2]."""
     return _square(h, CARRY) + x.sd_fy * x.sd_fy
 
 
 @compiled
-def _shown(h, x, c, sign):
+def _shown(h: Record, x: Record, c: int, sign: float) -> float:
     """A force without its bias [N]; one missing is the other finger's times `sign`, both are as last seen."""
     if not math.isnan(x.force[c]):
         return _force(h, x, c)
@@ -229,19 +235,19 @@ def _shown(h, x, c, sign):
 
 
 @compiled
-def _held_width(h, x, pads):
+def _held_width(h: Record, x: Record, pads: Pads) -> float:
     """Width of the held block [m]."""
     return block_width(x.d, _shown(h, x, 0, -1.0), _shown(h, x, 2, -1.0), pads)
 
 
 @compiled
-def _held_height(h, x, pads):
+def _held_height(h: Record, x: Record, pads: Pads) -> float:
     """Height of the held block [m]."""
     return block_y(x.y, _shown(h, x, 1, 1.0), _shown(h, x, 3, 1.0), pads)
 
 
 @compiled
-def _ungripped(h, x, span):
+def _ungripped(h: Record, x: Record, span: float) -> float:
     """Log density of the forces without a grip: silent, or from one finger only."""
     silent1 = silent2 = touch1 = touch2 = 0.0
     noise = _square(h, FORCE)
@@ -262,7 +268,10 @@ def _ungripped(h, x, span):
 
 
 @compiled
-def _log_known(value, factor, known, q, others, variance, share, span, rising):
+def _log_known(
+    value: float, factor: float, known: np.ndarray, q: int, others: int, variance: float, share: float,
+    span: float, rising: bool
+) -> float:  # fmt: skip
     """Log density of value = factor x quantity `q` given the evidence `known`; broad if unknown.
 
     An unknown quantity may resemble that of the `others`. `rising`: its density rises from 0, as a block has
@@ -290,7 +299,7 @@ def _log_known(value, factor, known, q, others, variance, share, span, rising):
 
 
 @compiled
-def _halting(h, x, span):
+def _halting(h: Record, x: Record, span: Record) -> tuple[float, float]:
     """Log density ratios of a hand that halts to one that moves: of motion aside, and of vertical motion."""
     aside = upward = 0.0
     moving = _square(h, VELOCITY)
@@ -305,7 +314,7 @@ def _halting(h, x, span):
 
 
 @compiled
-def free(h, x, span):
+def free(h: Record, x: Record, span: Record) -> float:
     """Log-likelihood of a reading in free motion."""
     aside, upward = _halting(h, x, span)
     still = aside + upward
@@ -319,7 +328,9 @@ def free(h, x, span):
 
 
 @compiled
-def held(h, known, block, num_blocks, x, span, pads):
+def held(
+    h: Record, known: np.ndarray, block: int, num_blocks: int, x: Record, span: Record, pads: Pads
+) -> float:
     """Log-likelihood of the features of a reading common to all grips of this block."""
     fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
     out = log_between((fx1 - fx2) / 2, 0.0, span.force, math.sqrt(_square(h, FORCE)))
@@ -333,7 +344,10 @@ def held(h, known, block, num_blocks, x, span, pads):
 
 
 @compiled
-def lifted(h, known, block, num_blocks, x, span, gravity, settled):
+def lifted(
+    h: Record, known: np.ndarray, block: int, num_blocks: int, x: Record, span: Record, gravity: float,
+    settled: float
+) -> float:  # fmt: skip
     """Log-likelihood of the remaining features, of a block above the ground.
 
     `settled`: probability that it has been there for a while, and may halt, or keep its height as arms do.
@@ -348,7 +362,9 @@ def lifted(h, known, block, num_blocks, x, span, gravity, settled):
 
 
 @compiled
-def supported(h, known, kind, block, x, span, pads, levels):
+def supported(
+    h: Record, known: np.ndarray, kind: int, block: int, x: Record, span: Record, pads: Pads, levels: bool
+) -> float:
     """Log-likelihood of the remaining features, of a block on its support.
 
     `levels`: whether the height at which the block rests counts.
@@ -388,7 +404,7 @@ FLOOR = 0.09  # chosen: least squared scale over a sample's variance: 0.3^2, as 
 
 
 @compiled
-def _learn_mean(evidence, value, variance, share, most):
+def _learn_mean(evidence: np.ndarray, value: float, variance: float, share: float, most: float) -> None:
     """Robust conjugate update of a mean by a value of this variance, with weight `share`."""
     if math.isnan(value):
         return
@@ -406,7 +422,7 @@ def _learn_mean(evidence, value, variance, share, most):
 
 
 @compiled
-def _learn_scale(evidence, residual, share, least):
+def _learn_scale(evidence: np.ndarray, residual: float, share: float, least: float) -> None:
     """Robust update of a squared scale, bounded below by `least`."""
     if math.isnan(residual):
         return
@@ -422,7 +438,10 @@ def _learn_scale(evidence, residual, share, least):
 
 
 @compiled
-def learn(h, known, kind, block, x, pads, gravity, share, levels):
+def learn(
+    h: Record, known: np.ndarray, kind: int, block: int, x: Record, pads: Pads, gravity: float,
+    share: float, levels: bool
+) -> None:  # fmt: skip
     """Update a hypothesis by a reading taken in its state, with weight `share`."""
     noise = _square(h, FORCE)
     if kind == FREE_KIND:

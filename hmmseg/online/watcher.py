@@ -16,7 +16,7 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, Task
 from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import GAP
-from hmmseg.online.answer import Answer
+from hmmseg.online.answer import Answer, Crossing
 from hmmseg.online.filter import Filter
 from hmmseg.online.wrist import Wrist, checked
 
@@ -218,6 +218,6 @@ class Watcher:
         return self.filter.finish()
 
     @property
-    def crossings(self) -> list:
+    def crossings(self) -> list[Crossing]:
         """The boundaries settled so far."""
         return self.filter.crossings

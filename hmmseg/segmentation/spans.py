@@ -59,7 +59,7 @@ class Span:
         """Such as `carry block1`."""
         return labelled(self.subtask, self.object)
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """The entry of one segment in the JSON of `segment`."""
         document = asdict(self)
         if not self.alternatives:
@@ -98,7 +98,7 @@ class Failure:
         number = "" if self.repetition is None else f"repetition {self.repetition}: "
         return f"does not fit its task at {self.label}: {number}{self.reason}"
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """The entry `failed` of one trial."""
         document = asdict(self)
         if self.repetition is None:
@@ -133,7 +133,7 @@ class Segmentation(Tabled):
         """Whether the recording shows every subtask of its task, in order."""
         return self.failed is None
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """The entry of one trial in the JSON of `segment`."""
         document = {
             "file": self.file,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import expit
@@ -65,7 +66,7 @@ def sought(f: Forms) -> list[Model]:
             first = sorted(found, key=lambda m: -m.score)[:REFINED]
             seen |= {m.effects: fitted(f, m.effects) for m in first}
             rough |= {*new} - {*seen}
-    best, kept = max(m.score for m in seen.values()), dict[tuple, Model]()
+    best, kept = max(m.score for m in seen.values()), dict[tuple[Any, ...], Model]()
     for m in sorted(seen.values(), key=lambda m: -m.score):
         if m.score > best - WINDOW or not m.effects:
             kept.setdefault(tuple(sorted(f.gap.candidates[j].form_of for j in m.effects)), m)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import tomlkit
 
 from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
 from simgap import channels
-from simgap.effect import Parameter
+from simgap.effect import Array, Parameter
 from simgap.effects.base import (
     KINEMATICS,
     DeadBand,
     HandEffect,
     Performance,
+    Values,
     World,
     gradient,
     interval_comment,
@@ -29,11 +33,11 @@ JOINTS = ("q11", "q12", "q21", "q22")
 LINKS = ("link11", "link12", "link21", "link22")
 
 
-def _numbers(values, names, common: str = "") -> np.ndarray:
+def _numbers(values: Mapping[str, float], names: Sequence[str], common: str = "") -> np.ndarray:
     return np.array([values.get(n, 0.0) + values.get(common, 0.0) for n in names])
 
 
-def correct_hand(world: World, values, on) -> World:
+def correct_hand(world: World, values: Values, on: Array) -> World:
     """The world as the true hand makes it."""
     return world._replace(
         joints=world.joints - _numbers(values, JOINTS) * world.jointed,
@@ -41,12 +45,12 @@ def correct_hand(world: World, values, on) -> World:
     )
 
 
-def apply_hand(p: Performance, values, rng) -> Performance:
+def apply_hand(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
     """Tips as computed with nominal geometry from the angles of a deviating hand."""
     return moved_joints(p, values, lambda q: q + _numbers(values, JOINTS))
 
 
-def moved_joints(p: Performance, values, change) -> Performance:
+def moved_joints(p: Performance, values: Values, change: Callable[[np.ndarray], np.ndarray]) -> Performance:
     """Tips as computed with nominal geometry from the angles (n, 4) of the true hand, passed through
     `change`."""
     if not p.rig.jointed:
@@ -65,7 +69,7 @@ def moved_joints(p: Performance, values, change) -> Performance:
     return p._replace(position=position, velocity=velocity)
 
 
-def _patched_link_length(document, found):
+def _patched_link_length(document: tomlkit.TOMLDocument, found: Mapping[str, Any]) -> dict[str, str] | None:
     """Put link lengths into the rig: all longer by `scale`, or each by its own share (link11: finger 1's
     first)."""
     if "fingers" not in document:
@@ -204,7 +208,7 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     )
 
 
-def _correct_backlash(world: World, values, on) -> World:
+def _correct_backlash(world: World, values: Values, on: Array) -> World:
     half, unseen = 0.5 * values["width"] * world.jointed, values["unseen"]
     band = within(world, half, unseen)
     return world._replace(
@@ -214,7 +218,7 @@ def _correct_backlash(world: World, values, on) -> World:
     )
 
 
-def _apply_backlash(p: Performance, values, rng) -> Performance:
+def _apply_backlash(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
     return moved_joints(p, {}, lambda q: np.stack([channels.play(a, values["width"]) for a in q.T], 1))
 
 
@@ -245,7 +249,7 @@ VARIED = 0.5  # prior: log sd of a carry's roll about that of all, as a second h
 ROLLS = np.geomspace(2e-4, 0.1, 40)  # prior: rad
 
 
-def _scatter_hand_roll(given, residual: np.ndarray):
+def _scatter_hand_roll(given: Any, residual: np.ndarray) -> Any:
     """Variance from roll, which shows only in the fingers' height difference, slowly: width times angle.
 
     Its power lies in the first cosines of each carry, evenly up to SLOW. A hand rolls in all carries;
@@ -277,7 +281,7 @@ def _scatter_hand_roll(given, residual: np.ndarray):
     return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
 
 
-def _apply_hand_roll(performance: Performance, values, rng) -> Performance:
+def _apply_hand_roll(performance: Performance, values: Values, rng: np.random.Generator) -> Performance:
     """A smooth random rotation of the given rms while something is carried."""
     t = performance.t
     angle = np.zeros(t.size)

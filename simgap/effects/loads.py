@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from hmmseg.io.rig import FORCE_CHANNELS
-from simgap.effect import Parameter
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
+from simgap.effect import Array, Parameter
 from simgap.effects.base import (
     CONTACT,
     HAND,
@@ -14,6 +16,7 @@ from simgap.effects.base import (
     HandEffect,
     Motion,
     Performance,
+    Values,
     World,
     flat,
     loading,
@@ -58,11 +61,11 @@ VISCOUS_DRAG = loading(
 MIDDLE = (0.13, 0.02)  # prior: m; about where the fingers work
 
 
-def _cable(m: Motion, values):
+def _cable(m: Motion, values: Values) -> Array:
     return values["stiffness"] * (m.position - MIDDLE * 2) + [values["at_x"], values["at_y"]] * 2
 
 
-def _report_cable_force(draws, rig):
+def _report_cable_force(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
     k = draws["stiffness"]
     k = np.where(np.abs(k) < 1e-3, 1e-3, k)
     places = {f"{axis}0": (MIDDLE[i] - draws[f"at_{axis}"] / k, "m") for i, axis in enumerate("xy")}
@@ -95,7 +98,7 @@ CABLE_FORCE = loading(
 LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known only by its impulse
 
 
-def _impact(m: Motion, values):
+def _impact(m: Motion, values: Values) -> Array:
     since = m.since[..., 2::4]
     inside = (since >= 0) & (since < LENGTH)
     pulse = np.where(inside, (1 - np.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0).sum(-1)
@@ -125,7 +128,7 @@ AMPLITUDES = tuple(
 )
 
 
-def _ringing(world: World, values) -> np.ndarray:
+def _ringing(world: World, values: Values) -> np.ndarray:
     omega = 2 * np.pi * values["frequency"]
     moves = world.events.shape[1] // 4
     total = np.zeros_like(world.force)
@@ -140,14 +143,16 @@ def _ringing(world: World, values) -> np.ndarray:
     return total
 
 
-def _correct_structural_vibration(world: World, values, on) -> World:
+def _correct_structural_vibration(world: World, values: Values, on: Array) -> World:
     # Ringing from loads is added to the prediction, not removed from the recording, whose noise stays the
     # same.
     ring = np.array([values[n] for n in ("frequency", "damping", "drive")])
     return with_mode(world, RINGING, on)._replace(force=world.force - _ringing(world, values), ring=ring)
 
 
-def _apply_structural_vibration(performance: Performance, values, rng) -> Performance:
+def _apply_structural_vibration(
+    performance: Performance, values: Values, rng: np.random.Generator
+) -> Performance:
     omega, zeta = 2 * np.pi * values["frequency"], values["damping"]
     since = performance.t[:, None] - performance.events[None, :]
     ring = np.where(since >= 0, np.exp(-zeta * omega * since.clip(0)) * np.sin(omega * since), 0.0).sum(1)
@@ -156,7 +161,7 @@ def _apply_structural_vibration(performance: Performance, values, rng) -> Perfor
     )
 
 
-def _report_structural_vibration(draws, rig):
+def _report_structural_vibration(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
     size = np.sqrt(sum(np.asarray(draws[name]) ** 2 for name in AMPLITUDES) / 4)
     units = {"frequency": "Hz", "damping": "1", "drive": "1"}
     return {name: (draws[name], unit) for name, unit in units.items()} | {"gain": (size, "N")}

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
+import tomlkit
 from scipy.special import expit
 
+from hmmseg.io.rig import Rig
 from simgap.channels import at_rest
 from simgap.channels.sensors import LOWPASS
-from simgap.effect import Parameter
+from simgap.effect import Array, Parameter
 from simgap.effects.base import (
     CONTACT,
     CREEPING,
     SLIDING,
     HandEffect,
     Performance,
+    Values,
     World,
     flat,
     interval_comment,
@@ -27,7 +33,7 @@ from simgap.effects.base import (
 FINGERS = ("give_normal1", "give_normal2", "give_shear1", "give_shear2")
 
 
-def _correct_fingertip_compliance(world: World, values, on) -> World:
+def _correct_fingertip_compliance(world: World, values: Values, on: Array) -> World:
     each = np.array([values[n] for n in FINGERS])
     return world._replace(
         give_normal=world.give_normal + values["give_normal"] + each[:2],
@@ -35,7 +41,7 @@ def _correct_fingertip_compliance(world: World, values, on) -> World:
     )
 
 
-def _report_fingertip_compliance(draws, rig):
+def _report_fingertip_compliance(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
     """True stiffnesses [N/m] from the additional compliances; a compliance is at least 1e-6 m/N."""
     tip, out = rig.fingertip, {}
     for name, give in draws.items():
@@ -45,14 +51,14 @@ def _report_fingertip_compliance(draws, rig):
     return out
 
 
-def _admitted_fingertip_compliance(rig):
+def _admitted_fingertip_compliance(rig: Rig) -> tuple[str, Values]:
     """Standard deviations of the pads' compliances [m/N], from those of their stiffnesses [1]."""
     tip, sds = rig.fingertip, rig.systematic.pad_stiffness
     give = {"normal": 1 / tip.normal_stiffness, "shear": 1 / tip.shear_stiffness}
     return "fingertip_compliance/1", {f"give_{k}{i + 1}": give[k] * sds[i] for k in give for i in (0, 1)}
 
 
-def _phrase_fingertip_compliance(means, rig):
+def _phrase_fingertip_compliance(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
     nominal, found = rig.get("normal_stiffness"), means.get("normal_stiffness")
     if nominal is None or found is None:
         return "other fingertips than the model's"
@@ -61,7 +67,9 @@ def _phrase_fingertip_compliance(means, rig):
     return "softer fingertips" if found < nominal else "stiffer fingertips"
 
 
-def _patched_fingertip_compliance(document, found):
+def _patched_fingertip_compliance(
+    document: tomlkit.TOMLDocument, found: Mapping[str, Any]
+) -> dict[str, str] | None:
     """Put pad stiffnesses into the rig, each with its former value and comment."""
     pads = table(document, "fingertip")
     names = [n for n in ("normal_stiffness", "shear_stiffness") if n in found]
@@ -110,14 +118,14 @@ FINGERTIP_COMPLIANCE = HandEffect(
 # deflection follows the force through a low-pass of time constant T (1 + ratio).
 
 
-def _correct_fingertip_creep(world: World, values, on) -> World:
+def _correct_fingertip_creep(world: World, values: Values, on: Array) -> World:
     ratio = values["ratio"]
     return with_mode(world, CREEPING, on)._replace(
         creep=world.creep + on * ratio / (1 + ratio), creep_time=values["time_constant"] * (1 + ratio)
     )
 
 
-def _apply_fingertip_creep(performance: Performance, values, rng) -> Performance:
+def _apply_fingertip_creep(performance: Performance, values: Values, rng: np.random.Generator) -> Performance:
     """Move tips at unchanged grip force as such a pad lets them."""
     pad, ratio = performance.rig.fingertip, values["ratio"]
     late = {"time_constant": values["time_constant"] * (1 + ratio)}
@@ -155,7 +163,7 @@ LOADED = 0.4
 HANGING = 0.9  # chosen: least share of a carry in which pads stick, as the block would fall otherwise
 
 
-def _correct_grip_slip(world: World, values, on) -> World:
+def _correct_grip_slip(world: World, values: Values, on: Array) -> World:
     force = world.force - world.load
     push = np.stack([force[..., 0], -force[..., 2]], -1)
     ratio = np.abs(force[..., 1::2]) / np.maximum(push, 0.5 * LOADED)

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from hmmseg.io.rig import FORCE_CHANNELS
 from simgap.channels.sensors import BIAS, DRIFT, LAG, LOWPASS
-from simgap.effect import Parameter
+from simgap.effect import Array, Parameter
 from simgap.effects.base import (
     LATE,
     MIX,
@@ -20,6 +20,7 @@ from simgap.effects.base import (
     SMOOTH,
     HandEffect,
     Spread,
+    Values,
     gradient,
     mixing,
     of_forces,
@@ -34,7 +35,7 @@ from simgap.gap.frame import CHANNELS
 # A constant offset of each force channel.
 
 
-def _phrase_force_bias(means, rig):
+def _phrase_force_bias(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
     worst = max(means, key=lambda k: abs(means[k]))
     total = sum(abs(v) for v in means.values())
     lone = total > 0 and abs(means[worst]) > 0.8 * total
@@ -58,7 +59,7 @@ FORCE_BIAS = of_forces(
 # Force channels that drift from the start of each trial, at a constant or a decreasing rate.
 
 
-def _since(t, last, values):
+def _since(t: Array, last: Array, values: Mapping[str, Array]) -> Array:
     """Effective seconds since the start, for a warm-up that slows down.
 
     The bend vanishes at the start and when the last block is left, so the mean slope is kept.
@@ -88,12 +89,12 @@ FORCE_DRIFT = of_forces(
 FINGERS = ("finger1", "finger2")
 
 
-def of_channels(values, common: str) -> np.ndarray:
+def of_channels(values: Mapping[str, float], common: str) -> np.ndarray:
     """A parameter of each force channel (4,): the sum of the common one, its finger's and its own."""
     return np.array([sum(values.get(n, 0.0) for n in (common, f"finger{c[-1]}", c)) for c in FORCE_CHANNELS])
 
 
-def _phrase_force_gain(means, rig):
+def _phrase_force_gain(means: Mapping[str, float], rig: Mapping[str, Any]) -> str:
     which = {k: v for k, v in means.items() if k != "gain"}
     if which:
         worst = max(which, key=lambda k: abs(which[k]))
@@ -122,14 +123,14 @@ FORCE_GAIN = mixing(
 # Cross-talk between the axes of a force sensor, and sensors mounted with a rotation.
 
 
-def _crosstalk(values):
+def _crosstalk(values: Values) -> np.ndarray:
     pair = np.array([[1.0, values["fx_from_fy"]], [values["fy_from_fx"], 1.0]])
-    return block_diag(pair, pair)
+    return np.asarray(block_diag(pair, pair))
 
 
-def _turned(values):
+def _turned(values: Values) -> np.ndarray:
     c, s = ([f(values[n]) for n in ("angle1", "angle2")] for f in (np.cos, np.sin))
-    return block_diag(*([[c[k], -s[k]], [s[k], c[k]]] for k in (0, 1)))
+    return np.asarray(block_diag(*([[c[k], -s[k]], [s[k], c[k]]] for k in (0, 1))))
 
 
 FORCE_CROSSTALK = mixing(
@@ -234,7 +235,7 @@ FORCE_LOWPASS = of_forces(
 WRITTEN = 1e-5  # prior: N; resolution to which files state forces that were not rounded before
 
 
-def _scatter_quantisation(given, residual: np.ndarray):
+def _scatter_quantisation(given: Any, residual: np.ndarray) -> Any:
     """Variance from rounding, if forces lie on a lattice.
 
     Values that were not rounded would all fall on its levels with a chance of WRITTEN / step each.
@@ -271,7 +272,7 @@ JITTERS = np.geomspace(5e-4, 0.03, 40)  # prior: s
 ALIKE = 3.0
 
 
-def _scatter_clock_jitter(given, residual: np.ndarray):
+def _scatter_clock_jitter(given: Any, residual: np.ndarray) -> Any:
     from simgap.gap.assemble import on_grid, rows_of
 
     rows, rate = rows_of(given), _clock_rates(given)[given.there]
@@ -280,7 +281,7 @@ def _scatter_clock_jitter(given, residual: np.ndarray):
     return on_grid("clock_jitter", residual**2, size[rows.cell], JITTERS, part, alike=ALIKE)
 
 
-def _clock_rates(given) -> np.ndarray:
+def _clock_rates(given: Any) -> np.ndarray:
     """Whitened change per second of clock error (T, N, C), whose mean over grouped samples counts."""
     world = given.frame.world
     _, velocity = tips(world)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from simgap.effect import Parameter
+from hmmseg.io.rig import Rig
+from simgap.effect import Array, Parameter
 from simgap.effects.base import (
     CONTACT,
     HAND,
     YIELDING,
     HandEffect,
     Performance,
+    Values,
     World,
     flat,
     turning_compliance,
@@ -39,7 +43,7 @@ OBJECT_INERTIA = HandEffect(
 # A block whose centre of mass is off its middle: the fingers share its weight unequally.
 
 
-def _apply_offcentre_mass(performance: Performance, values, rng) -> Performance:
+def _apply_offcentre_mass(performance: Performance, values: Values, rng: np.random.Generator) -> Performance:
     """Fingers that stay where they are shear their pads as the block turns between them, by the pads'
     usual compliance (the balance of moments of `simgap.gap.residuals.turned`)."""
     pad, width, force = performance.rig.fingertip, performance.width, flat(performance)
@@ -74,7 +78,7 @@ OFFCENTRE_MASS = HandEffect(
 WRONG = 0.05  # prior: relative error of a wrong measurement
 
 
-def _wrong_actual(given, push: np.ndarray) -> list:
+def _wrong_actual(given: Any, push: np.ndarray) -> list[Any]:
     """A candidate for each property that was measured apart from the trials."""
     from simgap.attribution.problem import Candidate
 
@@ -135,7 +139,7 @@ TABLE_TILT = HandEffect(
 # A support that yields under load, slightly delayed.
 
 
-def _correct_table_compliance(world: World, values, on) -> World:
+def _correct_table_compliance(world: World, values: Values, on: Array) -> World:
     # Its mass and damping delay it by some hundredths of a second.
 
     return with_mode(world, YIELDING, on)._replace(
@@ -144,7 +148,7 @@ def _correct_table_compliance(world: World, values, on) -> World:
     )
 
 
-def _report_table_compliance(draws, rig):
+def _report_table_compliance(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
     return {"stiffness": (1 / draws["give"].clip(1e-7), "N/m")}
 
 

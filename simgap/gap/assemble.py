@@ -99,7 +99,7 @@ def on_grid(
 
 def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Scatter]:
     """The scatter of each of the named effects in residuals (n,), if there is any."""
-    scattering: list[Callable] = [
+    scattering: list[Callable[..., Scatter | None]] = [
         e.scatter for n, e in catalogue().items() if n in names and e.scatter is not None
     ]
     found = [scatter(given, residual) for scatter in scattering]

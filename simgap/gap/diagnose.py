@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from estimation.consistency import check_motion
+from estimation.report import Actual
 from hmmseg.contact.decompose import PROPERTIES, UNITS, subtasks
 from hmmseg.jaxconfig import double_precision
 from hmmseg.robust import robust_sd
@@ -107,7 +108,7 @@ LISTED = 8  # look: effects that are described
 
 
 def body(
-    found: Search, verdict: Attribution, causes: Fitted | None, following: dict | None, seed: int
+    found: Search, verdict: Attribution, causes: Fitted | None, following: dict[str, Any] | None, seed: int
 ) -> dict[str, Any]:
     """The JSON document of a diagnosis.
 
@@ -205,7 +206,7 @@ def _summary(values: np.ndarray, unit: str) -> dict[str, Any]:
             "interval_90": [float(low), float(high)], "unit": unit}  # fmt: skip
 
 
-def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict]:
+def _shifts(found: Search, causes: Fitted | None) -> dict[str, dict[str, Any]]:
     """Identified or measured properties with rig.toml taken at its word (`before`) and with the causes
     (`after`).
 
@@ -303,7 +304,7 @@ class Diagnosis(Tabled):
 @double_precision
 def diagnose(
     aligned: AlignedTrials,
-    actual: dict | None = None,
+    actual: Actual | None = None,
     forced: Sequence[str] = (),
     seed: int = 0,
     progress: Progress | None = None,
@@ -354,7 +355,7 @@ def diagnose(
     return Diagnosis(document, found, causes, verdict, before, after, warnings, seed)
 
 
-def healthy_statistics(found: Search, healthy: AlignedTrials, actual: dict | None) -> Iterator[float]:
+def healthy_statistics(found: Search, healthy: AlignedTrials, actual: Actual | None) -> Iterator[float]:
     """Statistics [nats] of healthy recordings, in groups as large as the diagnosed one."""
     every = healthy.trials
     size = min(found.problem.frame.num_trials, len(every))

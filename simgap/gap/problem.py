@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
+from estimation.report import Actual
 from hmmseg.contact.decompose import PROPERTIES
 from simgap.attribution.problem import Rows, cosines
 from simgap.bounded import least
@@ -133,7 +134,7 @@ class Problem:
 
 
 def problem(
-    frame: Frame, actual: dict | None = None, identified: Mapping[tuple[str, str], float] | None = None
+    frame: Frame, actual: Actual | None = None, identified: Mapping[tuple[str, str], float] | None = None
 ) -> Problem:
     """Set up the problem of a frame, without nuisances.
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from estimation.identification import identify_aligned
+from estimation.report import Actual
 from hmmseg.contact.decompose import PROPERTIES
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
@@ -19,7 +20,7 @@ from simgap.attribution.problem import Gap
 from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.effects import catalogue, forms_of, name_of
-from simgap.effects.base import tips
+from simgap.effects.base import World, tips
 from simgap.gap.assemble import Scatter, gap_of, redrawn, scatters
 from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
 from simgap.gap.nuisances import with_nuisances
@@ -139,7 +140,7 @@ def realigned(aligned: AlignedTrials, given: Problem, found: Fitted, all_fit: bo
     return replace(again, rig=rig)
 
 
-def _hand(rig: Rig, world) -> Rig:
+def _hand(rig: Rig, world: World) -> Rig:
     """The rig with the pads that the candidate gives it."""
     give = {
         "normal_stiffness": float(np.mean(world.give_normal)),
@@ -202,7 +203,7 @@ class Search:
 
 def search(
     aligned: AlignedTrials,
-    actual: dict | None = None,
+    actual: Actual | None = None,
     excluded: Sequence[str] = (),
     forced: Sequence[str] = (),
     tell: Progress = silent,
@@ -249,7 +250,7 @@ def search(
                   identified, (*misled, *warnings))  # fmt: skip
 
 
-def _all_measured(aligned: AlignedTrials, actual: dict | None) -> bool:
+def _all_measured(aligned: AlignedTrials, actual: Actual | None) -> bool:
     """Whether every property was measured apart."""
     given = actual or {}
     return all(kind in given.get(name, {}) for name in aligned.task.objects for kind in PROPERTIES)
@@ -261,7 +262,7 @@ def _shown(aligned: AlignedTrials) -> list[Trial]:
 
 
 def _aligned_all(
-    failed: AlignedTrials, actual: dict | None, keys: Sequence[str]
+    failed: AlignedTrials, actual: Actual | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
     """Realign trials that all failed, if most fit their task after correction for one of the candidates.
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimation.priors import PROPERTY_LOG_SD
+from estimation.report import Actual
 from hmmseg.contact.decompose import PROPERTIES
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
@@ -134,7 +135,7 @@ def blocks_of(found: Search) -> Blocks:
     return {n: Block(*map(float, v)) for n, v in zip(given.frame.task.objects, values, strict=True)}
 
 
-def measured_on(blocks: Blocks, actual: dict | None) -> dict | None:
+def measured_on(blocks: Blocks, actual: Actual | None) -> Actual | None:
     """The same measurements, made of these blocks without error."""
     return actual and {
         name: {kind: (getattr(blocks[name], kind), sd) for kind, (_, sd) in of.items()}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 
@@ -104,7 +105,7 @@ class Scene:
     course: np.ndarray
     floor: np.ndarray
     ring: Ring | None = None
-    known: dict[tuple, np.ndarray] = field(default_factory=dict, repr=False)
+    known: dict[tuple[Any, ...], np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property
     def bins(self) -> np.ndarray:

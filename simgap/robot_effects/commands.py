@@ -83,7 +83,7 @@ def _late_by_time(names: list[str], acts: str):
 
 
 def _sagging(names: list[str], supply: str, usual: float):
-    def act(recording, theta):
+    def act(recording: Recording, theta: Theta) -> Recording:
         scale = 1 + theta["share"] * (recording[supply] / usual - 1)
         return recording.with_columns({n: scale * recording[n] for n in names})
 
