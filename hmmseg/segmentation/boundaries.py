@@ -12,7 +12,8 @@ cubic that joins both ends with the measured velocities; the density of its cros
 
 where s combines the propagated sensor noise with the uncertainty of the interpolation (Rice 1944;
 docs/segmentation.md). Touches stop the motion: they occur during a minimum-jerk motion (Flash and Hogan 1985)
-whose start and duration are common to both fingers.
+whose start and duration are common to both fingers. So do landings, but of a motion that is corrected on its
+way down: their speed wanders until they stop.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ NODES = (np.arange(POINTS) + 0.5) / POINTS  # numerics: the nodes, as shares of 
 BEND = 0.015  # prior: bend that the cubic misses, as a share of interval x change of velocity
 UNSEEN = 0.15  # prior: the same, as a share of the displacement that both velocities do not explain
 LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
-MOTION, MOTIONS = (0.05, 1.0), 8  # prior: s; duration of the motion that an impact ends: log-uniform
-STARTS = 24  # numerics: nodes over the time at which that motion started
+MOTION, MOTIONS = (0.05, 1.0), 16  # prior: s; duration of the motion that an impact ends: log-uniform
+STARTS = 48  # numerics: nodes over the time at which that motion started
 SHAPE = 0.05  # prior: relative deviation of its speed from the minimum-jerk profile
-STOP, STOPS = (0.002, 0.05), 10  # prior: s; time constant of the stop after an impact: log-uniform
+STOP = 0.01  # prior: s; time constant with which an impact stops the motion
+REBOUND = 0.7  # prior: relative deviation of the way that this takes, as a hand that hits fast rebounds
+SPEEDS = np.linspace(-3.0, 3.0, 13)  # numerics: nodes of a normal distribution of speeds, in its sd
 
-Kind = Literal["smooth", "impact", "launch"]
+Kind = Literal["smooth", "impact", "landing", "launch"]
 
 
 @dataclass(frozen=True)
@@ -43,9 +46,10 @@ class Crossing:
     """A quantity [m] known at both ends of a sample interval that crosses zero upwards inside it.
 
     `left`, `right`: its values; `v_left`, `v_right`: its rates [m/s]; `sd_*`: their noise. `kind`: "smooth"
-    motion through the crossing; "impact": motion is stopped by it (a touch, a touchdown); "launch": motion
-    starts with it (a block that was held down lifts off). `earlier`: an earlier sample, as (time before the
-    left end [s], value, rate).
+    motion through the crossing; "impact": one motion is stopped by it (a touch); "landing": one that is
+    corrected on its way is (a touchdown); "launch": motion starts with it (a block that was held down lifts
+    off). `earlier`: an earlier sample, as (time before the left end [s], value, rate). `restless` [m^2/s^3]:
+    variance a second by which the rate wanders before a landing.
     """
 
     left: float
@@ -57,11 +61,13 @@ class Crossing:
     sd_v: float
     kind: Kind = "smooth"
     earlier: tuple[float, float, float] | None = None
+    restless: float = 0.0
 
     @property
     def known(self) -> bool:
         """Whether all required samples are present."""
-        numbers = (self.left, self.right, self.v_left, self.v_right, self.sd_left, self.sd_right, self.sd_v)
+        numbers = (self.left, self.right, self.v_left, self.v_right, self.sd_left, self.sd_right, self.sd_v,
+                   self.restless)  # fmt: skip
         return bool(np.isfinite(numbers).all())
 
 
@@ -107,11 +113,9 @@ def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phas
 
     The motion of this `duration` [s] is at this `phase` (0 to 1) at the first sample. Its distance is unknown
     (log-uniform) and determined by gap and velocity of the first sample. The face that it hits is equally
-    likely anywhere along the way. After the hit the velocity decays to v_right with an unknown time constant,
-    which produces the compression `right`.
+    likely anywhere along the way.
     """
-    before, after = u * h, (1 - u) * h
-    at_hit = phase + before / duration
+    at_hit = phase + u * h / duration
     way = np.maximum(_minimum_jerk(at_hit) - _minimum_jerk(phase), 1e-9)
     rate, rate_at_hit = _minimum_jerk_slope(phase) / duration, _minimum_jerk_slope(at_hit) / duration
     gap, sd_v = -c.left, np.hypot(c.sd_v, SHAPE * max(c.v_left, -c.left / h))
@@ -132,32 +136,40 @@ def _log_impact(c: Crossing, h: float, u: np.ndarray, duration: np.ndarray, phas
     left_over = sum((x / sd) ** 2 for _, x, sd in readings) - weighed**2 / precision
     log_before = -0.5 * left_over - 0.5 * np.log(precision) - np.log(distance)
     speed = np.maximum(distance * rate_at_hit, c.sd_v)
-    stop = np.geomspace(*STOP, STOPS)[:, None, None, None]
-    reach = stop * -np.expm1(-after / stop)
-    # Negative residual of `right` after the velocity has decayed; in place, as these arrays are the largest.
-    apart = reach * (speed - c.v_right)
-    apart -= c.right - c.v_right * after
-    variance = reach**2 * (2 * SHAPE * speed) ** 2
-    variance += c.sd_right**2 + (c.sd_v * after) ** 2
-    log_after = _log_sum_normal(apart, variance)
-    return log_before + np.log(np.maximum(rate_at_hit, 1e-300)) + np.log(speed) + log_after
+    log_hit = np.log(np.maximum(rate_at_hit, 1e-300)) + np.log(speed)
+    return log_before + log_hit + _log_stopped(c, speed, (1 - u) * h)
+
+
+def log_landing(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
+    """Log likelihood of a landing at u, ending a motion that is corrected on its way.
+
+    One motion may end and another begin between two samples, so until the hit the rate wanders as it did
+    before (`restless`): integrated Brownian motion, of which way and speed at the hit are jointly normal.
+    """
+    before = (u * h)[:, None]
+    way = c.sd_left**2 + (before * c.sd_v) ** 2 + c.restless * before**3 / 3
+    both = before * c.sd_v**2 + c.restless * before**2 / 2
+    off = -c.left - c.v_left * before
+    sd = np.sqrt(np.maximum(c.sd_v**2 + c.restless * before - both**2 / way, 0.0))
+    speed = np.maximum(c.v_left + both / way * off + sd * SPEEDS, 0.0)
+    log_density = _log_stopped(c, speed, (1 - u[:, None]) * h) + np.log(np.maximum(speed, 1e-300))
+    log_hit = np.logaddexp.reduce(log_density - SPEEDS**2 / 2, axis=1)
+    return log_hit + _log_normal(off, 0.0, np.sqrt(way))[:, 0]
+
+
+def _log_stopped(c: Crossing, speed: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Log likelihood of the compression `right` [m], `after` [s] a hit at this `speed` [m/s].
+
+    The speed decays to v_right, on a way that is known only roughly: a hand that hits fast rebounds.
+    """
+    way = STOP * -np.expm1(-after / STOP) * (speed - c.v_right)
+    sd = np.sqrt(c.sd_right**2 + (c.sd_v * after) ** 2 + (REBOUND * way) ** 2)
+    return _log_normal(c.right, c.v_right * after + way, sd)
 
 
 def _log_normal(x: np.ndarray | float, mean: np.ndarray | float, sd: np.ndarray) -> np.ndarray:
     """Log density of a normal distribution up to a constant."""
     return -0.5 * ((x - mean) / sd) ** 2 - np.log(sd)
-
-
-def _log_sum_normal(x: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Log of the sum over the first axis of normal densities, up to a constant; overwrites its arguments."""
-    x *= x
-    x /= variance
-    x *= -0.5
-    peak = x.max(axis=0)
-    x -= peak
-    np.exp(x, out=x)
-    x /= np.sqrt(variance, out=variance)
-    return peak + np.log(x.sum(axis=0))
 
 
 def _minimum_jerk(phase: np.ndarray | float) -> np.ndarray | float:
@@ -241,7 +253,8 @@ def _crossed(c: Crossing, h: float) -> np.ndarray:
     """Probability (POINTS,) that one crossing has occurred by each node of an interval of h s."""
     if c.kind == "impact":
         return last_impact([c], h)
-    log_density = (log_smooth if c.kind == "smooth" else log_launch)(c, h, NODES)
+    shapes = {"smooth": log_smooth, "landing": log_landing, "launch": log_launch}
+    log_density = shapes[c.kind](c, h, NODES)
     density = np.exp(log_density - log_density.max())
     return np.cumsum(density / density.sum())
 

@@ -66,6 +66,13 @@ class Penetration:
     form: float
     hidden: bool = False
 
+    def restless(self, n: int) -> float:
+        """Variance a second [m^2/s^3] by which the rate wandered up to sample n; NaN if that is not seen."""
+        change, step = np.diff(self.rate[0, : n + 1]), np.diff(self.t[: n + 1])
+        there = np.isfinite(change)
+        wandered = float(np.sum(change[there] ** 2)) - 2 * self.sd_rate**2 * there.sum()
+        return max(wandered, 0.0) / float(step[there].sum()) if there.any() else np.nan
+
 
 def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihoods (num_samples,) of contact and of no contact, p integrated out; 0 for a missing sensor.
@@ -294,7 +301,9 @@ def _crossing(c: Penetration, n: int, change: Change) -> Crossing:
     before, after = float(c.rate[0, n]), float(c.rate[1, n + 1])
     if making:
         crossing = Crossing(gap, pressed, before, after, c.sd_place, sd_pressed, c.sd_rate, kind)
-        if n == 0 or len(change.contacts) == 1:  # a block is set down in several motions
+        if kind == "landing":
+            return replace(crossing, restless=c.restless(n))
+        if n == 0:
             return crossing
         earlier = (float(c.t[n] - c.t[n - 1]), float(c.place[n - 1]), float(c.rate[0, n - 1]))
         return replace(crossing, earlier=earlier) if np.isfinite(earlier).all() else crossing

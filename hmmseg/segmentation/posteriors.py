@@ -66,7 +66,7 @@ class Contacts:
             if self.signals.timing is not None:
                 nearest = self.signals.timing[stretch][:: 1 if making else -1][:2]
                 timing = float(np.hypot(timing, np.median(nearest)))
-            return restricted(Change((load,), prior, making, "impact" if making else "launch", timing))
+            return restricted(Change((load,), prior, making, "landing" if making else "launch", timing))
         return None
 
     def _finger(self, i: int, held: np.ndarray, making: bool) -> Penetration:

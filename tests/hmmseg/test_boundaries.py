@@ -15,7 +15,6 @@ from hmmseg.segmentation.boundaries import (
     ONSET,
     POINTS,
     SHAPE,
-    STOP,
     UNIFORM,
     BoundaryPosterior,
     Crossing,
@@ -42,6 +41,7 @@ NODES = (np.arange(POINTS) + 0.5) / POINTS * WIDTH
 SOME = [
     Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
     Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "impact"),
+    Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "landing", restless=0.01),
     Crossing(-2e-4, 1e-3, 0.01, 0.05, 3e-6, 3e-5, 2e-3, "launch"),
 ]
 
@@ -163,7 +163,7 @@ def touches(rng, width, num=1):
         v = distance * _minimum_jerk_slope(at_hit) / duration
         left = -distance * (_minimum_jerk(at_hit) - _minimum_jerk(phase))
         v_left = (1 + SHAPE * rng.normal()) * distance * _minimum_jerk_slope(phase) / duration
-        stop, after = np.exp(rng.uniform(*np.log(STOP))), width - root
+        stop, after = np.exp(rng.uniform(*np.log((0.002, 0.05)))), width - root
         right = v * stop * -np.expm1(-after / stop)
         noise = rng.normal(size=4)
         roots.append(root)
@@ -226,6 +226,54 @@ def test_ninety_percent_intervals_cover(case):
     share = coverage(case, np.random.default_rng(3))
     # Wider than nominal by design: bends that the cubic misses, a uniform part.
     assert 0.86 < share < 0.99, share
+
+
+def rebounding(rng):
+    """A touch by a hand of 0.14 kg that hits a pad of 3000 N/m at 0.1 to 0.4 m/s: when, and its ends."""
+    duration, way = rng.uniform(0.08, 0.14), rng.uniform(0.01, 0.02)
+    at = rng.uniform(0.35, 0.65) * duration
+    root = rng.uniform(0.0, min(WIDTH, at))
+    before, hit = (at - root) / duration, at / duration
+    v_left, speed = (way * _minimum_jerk_slope(phase) / duration for phase in (before, hit))
+    natural, damping, after = np.sqrt(3000 / 0.14), rng.uniform(0.2, 0.5), WIDTH - root
+    decay, swing = damping * natural, natural * np.sqrt(1 - damping**2)
+    wave, turn = np.exp(-decay * after) * np.array([np.sin(swing * after), np.cos(swing * after)])
+    left, right = way * (_minimum_jerk(before) - _minimum_jerk(hit)), max(speed / swing * wave, 0.0)
+    v_right = speed * (turn - decay / swing * wave)
+    sd = np.array([2e-5, 2e-5, 5e-3, 5e-3])
+    return root, Crossing(*([left, right, v_left, v_right] + sd * rng.normal(size=4)), *sd[:3], "impact")
+
+
+def wandering(rng, spread=1.0):
+    """A landing on whose way other motions begin: the rate wanders by `spread` [m/s] in a second."""
+    step = WIDTH / 500
+    while True:
+        rate = 0.05 + np.cumsum(np.r_[0.0, spread * np.sqrt(step) * rng.standard_normal(500)])
+        value = np.r_[0.0, np.cumsum((rate[1:] + rate[:-1]) / 2 * step)] - rng.uniform(0, 4e-3)
+        hit = int(np.argmax(value >= 0))
+        if value[0] < 0 and hit:
+            after, stop = WIDTH - hit * step, np.exp(rng.uniform(*np.log((0.002, 0.05))))
+            right, v = rate[hit] * stop * -np.expm1(-after / stop), rate[hit] * np.exp(-after / stop)
+            noise = 2e-5 * rng.standard_normal(2)
+            ends = value[0] + noise[0], right + noise[1], rate[0], v
+            return hit * step, Crossing(*ends, 2e-5, 2e-5, 2e-3, "landing", restless=spread**2)
+
+
+@pytest.mark.parametrize("case", [rebounding, wandering])
+def test_fast_hands_rebound_and_correct_their_way(case):
+    share = coverage(case, np.random.default_rng(6), 300)
+    assert 0.86 < share < 0.99, share
+    assert coverage(lambda rng: (lambda t, c: (t, replace(c, restless=0.0)))(*wandering(rng)),
+                    np.random.default_rng(6), 300) < 0.7  # fmt: skip
+
+
+def test_how_much_a_rate_wanders_is_read_off_the_samples_before():
+    t, rng = np.arange(4000) * 0.02, np.random.default_rng(7)
+    rate = np.cumsum(0.5 * np.sqrt(0.02) * rng.standard_normal(t.size)) + 3e-2 * rng.standard_normal(t.size)
+    rate[100:200] = np.nan
+    c = Penetration(t, 0 * t, 0 * t, np.stack([rate, rate]), 1e-6, 1e-6, 1e-5, 3e-2, 0.0)
+    assert c.restless(t.size - 1) == pytest.approx(0.25, rel=0.15)
+    assert np.isnan(c.restless(0)) and c.restless(50) >= 0
 
 
 @pytest.mark.parametrize("gap", [0.25, 0.5])
