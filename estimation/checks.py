@@ -38,11 +38,9 @@ MEANING = {
 
 @dataclass(frozen=True)
 class PredictiveCheck:
-    """Posterior-predictive p-value per channel, and warnings for small ones.
-
-    `excess`: sd between grips beyond the sensors' noise, posterior median, per channel (N, m, m); `repeats`:
-    number of observations that determine it, 0 if only the prior does.
-    """
+    """Posterior-predictive p-value per channel, and warnings for small ones. `excess`: sd between grips
+    beyond the sensors' noise, posterior median, per channel (N, m, m); `repeats`: number of observations that
+    determine it, 0 if only the prior does."""
 
     p_values: dict[str, float]
     excess: dict[str, float]
@@ -135,10 +133,8 @@ def misfits(aligned: AlignedTrials) -> list[str]:
 
 
 def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> list[str]:
-    """Blocks too heavy for their size in any material: forces in a smaller unit than N.
-
-    `found`: means by (object, property) [N, m].
-    """
+    """Blocks too heavy for their size in any material: forces in a smaller unit than N. `found`: means by
+    (object, property) [N, m]."""
     for obj in task.objects:
         weight, width = (found.get((obj, prop), 0.0) for prop in ("weight", "width"))
         height = found.get((obj, "height"), width)

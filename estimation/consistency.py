@@ -73,10 +73,8 @@ FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
 @dataclass(frozen=True)
 class Grip:
-    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move.
-
-    `beneath`: objects from its support down to the ground.
-    """
+    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move. `beneath`:
+    objects from its support down to the ground."""
 
     move: int
     key: str
@@ -90,11 +88,9 @@ class Grip:
 
 @dataclass(frozen=True)
 class Tie:
-    """One tie: its violation, and the properties that depend on it.
-
-    `value` +- `error`: error of the scale; `made`: sd of healthy hands that the rig itself admits, in
-    addition to WELL_MADE; `properties` depend on it; `text` describes the violation.
-    """
+    """One tie: its violation, and the properties that depend on it. `value` +- `error`: error of the scale;
+    `made`: sd of healthy hands that the rig itself admits, in addition to WELL_MADE; `properties` depend on
+    it; `text` describes the violation."""
 
     kind: str
     value: float
@@ -247,11 +243,9 @@ def _rigidity(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterat
         steep = float(np.median(slopes[:, k]))
         spread = robust_sd(slopes[:, k] - steep)
         error = max(spread, float(np.sqrt(np.median(variances[:, k])))) / np.sqrt(len(slopes))
-        text = (
-            f"the fingers' distance changes by {1e2 * abs(steep):.2g} cm a metre that the hand carries a "
-            f"block {axis}, which no block does: joint angles, links or bases are farther off than "
-            "[systematic] in rig.toml admits"
-        )
+        text = (f"the fingers' distance changes by {1e2 * abs(steep):.2g} cm a metre that the hand carries a "
+                f"block {axis}, which no block does: joint angles, links or bases are farther off than "
+                "[systematic] in rig.toml admits")  # fmt: skip
         yield Tie("rigidity", steep, error, ("width", "height"), text, made)
 
 
@@ -386,10 +380,8 @@ TELLING = 1.0  # limit: sd of the pads' share along the grip beyond which grips 
 
 @dataclass(frozen=True)
 class ForceScale:
-    """Posterior of the factor g by which vertical forces are read too large.
-
-    `probability` that forces are misread; `density` (len(GRID),) of log g if they are.
-    """
+    """Posterior of the factor g by which vertical forces are read too large. `probability` that forces are
+    misread; `density` (len(GRID),) of log g if they are."""
 
     probability: float
     density: np.ndarray
@@ -415,10 +407,8 @@ class ForceScale:
 def force_scale(
     doubts: Mapping[str, PadDoubt], weighed: Sequence[WeighedTrial], rig: Rig
 ) -> ForceScale | None:
-    """Scale of the forces if pads and noise give any evidence against 1, else None.
-
-    Not applicable to late forces, which flatten the slopes of readings over them.
-    """
+    """Scale of the forces if pads and noise give any evidence against 1, else None. Not applicable to late
+    forces, which flatten the slopes of readings over them."""
     tip = rig.fingertip
     if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
         return None

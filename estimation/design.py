@@ -58,10 +58,8 @@ Terms = dict[str, int]
 
 
 def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[Terms]:
-    """Independent integer combinations of the unknowns in `order` that span `rows`, single ones first.
-
-    Each is {unknown: coefficient} with coprime coefficients, the first of them positive.
-    """
+    """Independent integer combinations of the unknowns in `order` that span `rows`, single ones first. Each
+    is {unknown: coefficient} with coprime coefficients, the first of them positive."""
     given = [
         _whole({k: Fraction(v) for k, v in row.items() if v}, order) for row in rows if any(row.values())
     ]
@@ -164,11 +162,9 @@ UNLIKE = 0.3  # prior: difference between both pads, as a share of their common 
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One deviation of the hand: its name, prior standard deviation, and effect.
-
-    `read(trial, rig, size)` gives the task-space signals of a trial by a hand that deviates by `size` from
-    the nominal rig; `step` is a small deviation for finite differences.
-    """
+    """One deviation of the hand: its name, prior standard deviation, and effect. `read(trial, rig, size)`
+    gives the task-space signals of a trial by a hand that deviates by `size` from the nominal rig; `step` is
+    a small deviation for finite differences."""
 
     name: str
     sd: float
@@ -202,8 +198,7 @@ class PadDoubt:
     Their compliance seems 1 + `share` times the nominal; `odds` is the probability that the rig is wrong by
     that. `apart`: error common to all slopes. `give`: possible give of pads whose stiffness the rig leaves
     unstated, according to the recordings; 0 if it states one. `usual`: typical force of one finger in a grip,
-    or where a block is put down [N]. `seen`: the share and its sd whatever the odds, infinite if unknown.
-    """
+    or where a block is put down [N]. `seen`: the share and its sd whatever the odds, infinite if unknown."""
 
     share: float = 0.0
     odds: float = 0.0
@@ -214,27 +209,21 @@ class PadDoubt:
 
     @property
     def extra_sd(self) -> float:
-        """Prior standard deviation of the share beyond what the rig admits.
-
-        A mixture of 0 if the rig is right, and of the share that the slopes show if it is wrong.
-        """
+        """Prior standard deviation of the share beyond what the rig admits. A mixture of 0 if the rig is
+        right, and of the share that the slopes show if it is wrong."""
         return abs(self.share) * float(np.sqrt(self.odds))
 
     @property
     def slope_sd(self) -> float:
-        """Common error of the slopes, and of each slope on its own.
-
-        A share of the true give, and the common effect of noise in forces or places.
-        """
+        """Common error of the slopes, and of each slope on its own. A share of the true give, and the common
+        effect of noise in forces or places."""
         return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 
 def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
         """Pads whose compliance is 1 + size of the nominal, so that their faces lie elsewhere under a force.
-
-        With `usual`: pads that give as force^(1 + size), as the nominal at that force; to first order.
-        """
+        With `usual`: pads that give as force^(1 + size), as the nominal at that force; to first order."""
         signals, moved = task_space(trial, rig), {}
         for finger in fingers:
             name = f"{'x' if kind == 'normal' else 'y'}{finger}"
@@ -256,11 +245,9 @@ def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
 def nuisances(
     rig: Rig, biased: np.ndarray, doubts: Mapping[str, PadDoubt], touch_sd: float = 0.0
 ) -> tuple[Nuisance, ...]:
-    """Deviations that the rig admits, and those that recordings reveal.
-
-    `biased` (4,): extra prior sd of each force bias [N]; `doubts`: about the pads, "normal" and "shear";
-    `touch_sd` [m]: uncertainty of the distance at which the fingers touch a block.
-    """
+    """Deviations that the rig admits, and those that recordings reveal. `biased` (4,): extra prior sd of each
+    force bias [N]; `doubts`: about the pads, "normal" and "shear"; `touch_sd` [m]: uncertainty of the
+    distance at which the fingers touch a block."""
     s, out = rig.systematic, list[Nuisance]()
 
     def admit(name: str, sd: float, step: float, read: Callable[[Trial, Rig, float], Signals]) -> None:
@@ -332,9 +319,7 @@ def pad_doubts(
     slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
 ) -> dict[str, PadDoubt]:
     """Evidence of slopes (num_trials, num_moves, len(SLOPES)) against the rig's pads, "normal" and "shear".
-
-    `variance`, `alike`: as in `slope_variances`, of all trials.
-    """
+    `variance`, `alike`: as in `slope_variances`, of all trials."""
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
     for s, grip in ((a.signals, grip) for a in weighed for grip in a.grips.values()):
         along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
@@ -367,11 +352,9 @@ def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int])
 
 
 def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndarray:
-    """Units of the shares of model error (num_trials, num_moves, 3) [N, m, m].
-
-    That of a rise is at least the give under the weight, and the change of give in landing: what a pad does
-    in between need not cancel where contact forces balance.
-    """
+    """Units of the shares of model error (num_trials, num_moves, 3) [N, m, m]. That of a rise is at least the
+    give under the weight, and the change of give in landing: what a pad does in between need not cancel where
+    contact forces balance."""
     force = np.abs(raw[..., FORCE]).mean(axis=1)
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
     gives = []
@@ -389,11 +372,9 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
 def free_means(
     weighed: Sequence[WeighedTrial], noise: Noise, free_steps: Sequence[int], rig: Rig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N].
-
-    A zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
-    the rig's own bias allow, is known in a grip no better than these stretches agree.
-    """
+    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N]. A
+    zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and the
+    rig's own bias allow, is known in a grip no better than these stretches agree."""
     mean = np.stack([free_forces(a.signals, a) for a in weighed])
     count = np.array([max(a.free_count, 1.0) for a in weighed])
     of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
@@ -453,11 +434,9 @@ BIASED = 0.0025  # prior: share of forces with a wrong nominal zero: all four in
 
 
 def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
-    """Extra prior sd (4,) of force biases [N] that free motion shows and the rig does not admit.
-
-    Forces in free motion should vanish, up to noise and the rig's own [systematic]. A bias as wide as their
-    pooled mean explains that better by (z^2 - 1) / 2 - log z nats; it is allowed if that makes it probable.
-    """
+    """Extra prior sd (4,) of force biases [N] that free motion shows and the rig does not admit. Forces in
+    free motion should vanish, up to noise and the rig's own [systematic]. A bias as wide as their pooled mean
+    explains that better by (z^2 - 1) / 2 - log z nats; it is allowed if that makes it probable."""
     precision = 1.0 / variance
     total = np.maximum(precision.sum(axis=0), np.finfo(float).tiny)  # a force that is never read has none
     pooled = (mean * precision).sum(axis=0) / total
@@ -478,8 +457,7 @@ class Design:
     N): forces in free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force
     biases that free motion shows and the rig does not admit; `doubts`: the same for the pads; `level_rises`:
     mean recorded rise by move between equal heights [m]; `moved` (4,): how far the forces' zeros move within
-    a trial [N].
-    """
+    a trial [N]."""
 
     unknowns: tuple[Unknown, ...]
     nuisances: tuple[Nuisance, ...]
@@ -584,8 +562,7 @@ def _combined(
 
     Alignments are imputations, so the variance is that within one alignment plus 1 + 1 / S times that between
     them (Rubin 1987, Multiple Imputation, equation 3.1.5). Differences that follow from the coefficients of a
-    longer or shorter span do not count as variation between alignments.
-    """
+    longer or shorter span do not count as variation between alignments."""
     used = np.moveaxis(valid, 1, -1)[where]  # K, S
     num = used.sum(axis=1)
 

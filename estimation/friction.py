@@ -40,10 +40,8 @@ def ground_friction(
     weight: np.ndarray | None, rng: np.random.Generator,
 ) -> GroundFriction | None:  # fmt: skip
     """Friction of a block on the support it is slid on; None if it is not slid, or the data are insufficient.
-
     The law d fx = mu (W - fy) + W d a / g is linear in mu if `weight`, draws (num_draws,) of W [N], is given,
-    and in mu W, mu and W otherwise. If a task slides the block on several supports, the last one counts.
-    """
+    and in mu W, mu and W otherwise. If a task slides the block on several supports, the last one counts."""
     slid = [s for s in steps if s.object == obj and s.state == SLIDING and s.move is not None]
     if not slid:
         return None
@@ -96,12 +94,9 @@ NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
 
 @dataclass(frozen=True)
 class Stretch:
-    """One finger on one resting block, arrays (num_samples,).
-
-    `t` [s], `anchor` [m] (height less nominal shear deflection) and its noise `sd` [m], `shear` [N], signed
-    `ratio` of shear to normal force and its noise `ratio_sd`; `compliance` [m/N]: standard deviation of the
-    pad's compliance error.
-    """
+    """One finger on one resting block, arrays (num_samples,). `t` [s], `anchor` [m] (height less nominal
+    shear deflection) and its noise `sd` [m], `shear` [N], signed `ratio` of shear to normal force and its
+    noise `ratio_sd`; `compliance` [m/N]: standard deviation of the pad's compliance error."""
 
     t: np.ndarray
     anchor: np.ndarray
@@ -124,10 +119,8 @@ class SlipEvidence:
 def slip_evidence(
     stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
 ) -> SlipEvidence:
-    """Evidence for slip in one block's grips, whose coefficient is its bound: draws (num_draws,).
-
-    `others`: stretches with other blocks, which show the drift of anchors without slip.
-    """
+    """Evidence for slip in one block's grips, whose coefficient is its bound: draws (num_draws,). `others`:
+    stretches with other blocks, which show the drift of anchors without slip."""
     stretches = [s for s in stretches if s.t.size > 2]
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)
@@ -200,8 +193,7 @@ def largest_ratio(
 
     `ratio`, `sd` (num_samples,): measured absolute ratios and their noise; `held` (num_alignments,
     num_samples): under which drawn alignments each sample counts. Alignments are marginalised in the maximum;
-    G is learned from the samples of all of them.
-    """
+    G is learned from the samples of all of them."""
     end = float(np.max(ratio + REACH * sd))
     edges = np.linspace(0.0, end, int(np.clip(BINS_PER_SD * end / sd.min(), 20, MAX_BINS)) + 1)
     centres = (edges[1:] + edges[:-1]) / 2
@@ -240,10 +232,8 @@ def largest_ratio(
 
 
 def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples in each bin (num_bins,) after redrawing the location of every atom with its samples.
-
-    Without this step an atom with many samples would never leave its bin.
-    """
+    """Samples in each bin (num_bins,) after redrawing the location of every atom with its samples. Without
+    this step an atom with many samples would never leave its bin."""
     atoms, member = np.unique(bins, return_inverse=True)
     joint = np.zeros((atoms.size, log_likelihood.shape[1]))
     np.add.at(joint, member, log_likelihood)
@@ -261,8 +251,7 @@ class FrictionPosterior:
 
     `lower_bound`: 5 % quantile of `bound_draws` (num_draws,), the posterior of the largest ratio; None with a
     `reason` if the block was not held. `mu_draws` (num_draws,) only if slip was seen, otherwise `reason`
-    tells why there is no value. `ground`: friction of the block on its support, if it was slid.
-    """
+    tells why there is no value. `ground`: friction of the block on its support, if it was slid."""
 
     lower_bound: float | None
     bound_draws: np.ndarray | None = None
@@ -297,11 +286,9 @@ def friction_posteriors(
     weighed: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
     rng: np.random.Generator, weights: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
-    """Friction of every object of the task, all trials pooled, alignments marginalised.
-
-    `sd_force`: noise of one force sample [N] if the signals do not state it; `weights`: posterior draws of
-    objects' weights [N].
-    """
+    """Friction of every object of the task, all trials pooled, alignments marginalised. `sd_force`: noise of
+    one force sample [N] if the signals do not state it; `weights`: posterior draws of objects' weights
+    [N]."""
     steps = subtasks(task)
     fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in weighed]
     held = {obj: _held(weighed, fingers, steps, obj) for obj in task.objects}
@@ -327,10 +314,8 @@ def friction_posteriors(
 
 
 def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
-    """Forces of one finger less their mean in free motion, where they should vanish.
-
-    Variation in free motion beyond the sensors' noise (a cable that pulls) counts as noise.
-    """
+    """Forces of one finger less their mean in free motion, where they should vanish. Variation in free motion
+    beyond the sensors' noise (a cable that pulls) counts as noise."""
     free, stated = a.free > 0, a.signals.sd_force
     stated = stated if np.isfinite(stated) else sd_force
     centred, sds = [], []
@@ -350,11 +335,9 @@ def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
 
 
 def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment.
-
-    While a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the ratio of
-    two small forces is uninformative.
-    """
+    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment. While a
+    pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the ratio of two small
+    forces is uninformative."""
     recorded = np.isfinite(forces.normal + forces.shear)
     core = (holding.mean(axis=0) > 0.5) & recorded
     if not core.any():

@@ -154,10 +154,8 @@ def _pooled(key: str, estimates: Sequence[Estimate]) -> dict[str, Any] | None:
 def _heights(
     trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ...]
 ) -> dict[str, list[Estimate]]:
-    """Height of every object in each trial that determines it, by least squares.
-
-    Means are assumed independent; heights are absolute values, as in Table 3.
-    """
+    """Height of every object in each trial that determines it, by least squares. Means are assumed
+    independent; heights are absolute values, as in Table 3."""
     heights: dict[str, list[Estimate]] = {name: [] for name in task.objects}
     for trial in trials:
         rows, rises, labels = [], [], []

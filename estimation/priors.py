@@ -20,11 +20,9 @@ COMMON = np.array([5e-4, 1e-3, 0.03])  # prior: sd of the share common to all gr
 
 
 def log_prior(prop: str, coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Log density (N,), up to a constant, of values (N,) of sum(coefficients * property of an object).
-
-    A sum of independent log-normal variables is approximated by the log-normal of the same first two moments
-    (Fenton 1960), one with differences by the normal. -inf for non-positive values of a positive sum.
-    """
+    """Log density (N,), up to a constant, of values (N,) of sum(coefficients * property of an object). A sum
+    of independent log-normal variables is approximated by the log-normal of the same first two moments
+    (Fenton 1960), one with differences by the normal. -inf for non-positive values of a positive sum."""
     of_one = PROPERTY_LOG_SD[prop] ** 2
     each = PROPERTY_MEDIAN[prop] * np.exp(of_one / 2)
     mean = coefficients.sum() * each

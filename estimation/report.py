@@ -145,10 +145,8 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
 
 def property_rows(body: dict[str, Any], measured: Actual | None = None) -> list[dict[str, str]]:
     """One row per property as text: estimate, intervals, measured value, deviation, and its source.
-
     `deviation`: of the estimate from the measured value in per cent; `from`: the subtasks that determine it,
-    or why it is unknown. What only a combination of properties is determined for comes last.
-    """
+    or why it is unknown. What only a combination of properties is determined for comes last."""
     rows, entries = [], [(o, p, e) for o, own in body["properties"].items() for p, e in own.items()]
     for one in body.get("combinations", ()):
         terms = {key.rpartition(".")[0]: number for key, number in one["of"].items()}

@@ -28,9 +28,7 @@ STEP, REACH = 0.25, (-10.0, 10.0)  # numerics: of the grid, in log(share / its p
 @dataclass(frozen=True)
 class Proposal:
     """Multivariate t of the noise scales, `mean` (3,) and `chol` (3, 3); grid densities of the scatters.
-
-    `cells` (3, G): probabilities of the grid's intervals, of width STEP from REACH[0] on.
-    """
+    `cells` (3, G): probabilities of the grid's intervals, of width STEP from REACH[0] on."""
 
     mean: np.ndarray
     chol: np.ndarray
@@ -100,8 +98,7 @@ class Draws(Brief):
     R-hat over scales, with walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 6): model error
     common to all grips; `deviations` (walkers, steps, N) of the hand. `prior_ess`: effective share of draws
     after weighting by the unknowns' priors. `impossible`: unknowns all of whose draws have an impossible
-    sign.
-    """
+    sign."""
 
     scales: np.ndarray
     chain: np.ndarray
@@ -217,10 +214,8 @@ def _resampled(weight: np.ndarray, random: np.random.RandomState) -> np.ndarray:
 
 
 def effective_sample_size(chain: np.ndarray) -> float:
-    """Smallest effective sample size over parameters of a chain (walkers, steps, dim).
-
-    By emcee's autocorrelation time (Goodman & Weare 2010); 0 if a parameter never moved.
-    """
+    """Smallest effective sample size over parameters of a chain (walkers, steps, dim). By emcee's
+    autocorrelation time (Goodman & Weare 2010); 0 if a parameter never moved."""
     import emcee  # slow to import: it loads scipy.stats
 
     with np.errstate(invalid="ignore"):  # 0 / 0 of a walker that never moved
@@ -234,8 +229,7 @@ def split_rhat(chain: np.ndarray) -> float:
 
     Walkers are joined into GROUPS chains (one walker alone is too short to have a variance of its own), each
     halved in time: Gelman et al. 2013, Bayesian Data Analysis, section 11.4. Walkers of an ensemble are not
-    independent, so this only detects drift and stuck groups.
-    """
+    independent, so this only detects drift and stuck groups."""
     walkers, steps, dim = chain.shape
     half, per_group = steps // 2, walkers // GROUPS
     kept = chain[: GROUPS * per_group, : 2 * half].reshape(GROUPS, per_group, 2, half, dim)

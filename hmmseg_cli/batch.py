@@ -40,9 +40,7 @@ class Segmented:
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
     """The paths, with plain folders replaced by the recordings in them, in the order of their names.
-
-    Recordings in .txt files must be named: in a folder they might be notes.
-    """
+    Recordings in .txt files must be named: in a folder they might be notes."""
     out, kinds = list[Path](), [kind for kind in KINDS if kind != ".txt"]
     for path in paths:
         inside = [path]
@@ -84,8 +82,7 @@ def segment_apart(
 
     A recording whose worker is lost is segmented again by itself; if that worker is lost too, it is left out
     with a warning to `tell`. InputError if a recording or the cluster is at fault; the rest is then
-    cancelled.
-    """
+    cancelled."""
     left, lab = list(paths), (task.absolute(), rig.absolute())
     while left:
         with _executor(workers, scheduler) as executor:

@@ -71,11 +71,9 @@ def _write_groups(formatter: Any, rows: Iterable[tuple[str, tuple[str, str] | No
 
 
 class Output:
-    """Destinations of one command's results: the screen, a JSON document, figures and a report.
-
-    A context manager. `print` and `warn` show text, `figure` and `stage` return paths to draw and write to,
-    and `finish` puts everything in place. Raises InputError at once if a destination cannot be written.
-    """
+    """Destinations of one command's results: the screen, a JSON document, figures and a report. A context
+    manager. `print` and `warn` show text, `figure` and `stage` return paths to draw and write to, and
+    `finish` puts everything in place. Raises InputError at once if a destination cannot be written."""
 
     def __init__(self, command: str, *, json: str | None = None, figures: Path | None = None,
                  report: Path | None = None, seed: int = 0, quiet: bool = False) -> None:  # fmt: skip
@@ -116,10 +114,8 @@ class Output:
         self._cleanup.close()
 
     def print(self, *renderables: Any, whole: bool = False) -> None:
-        """Show tables or text on standard output, or on standard error if `--json -` takes that.
-
-        `whole`: lines are not wrapped, so that they can be copied.
-        """
+        """Show tables or text on standard output, or on standard error if `--json -` takes that. `whole`:
+        lines are not wrapped, so that they can be copied."""
         for renderable in renderables:
             with self._console.unless_lost():
                 self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
@@ -208,11 +204,9 @@ def _plain(value: Any) -> Any:
 
 
 def distinct_trials(paths: Sequence[Path]) -> list[Path]:
-    """The trials' paths, `FILE#NAME` for each recording of a file with several.
-
-    InputError if a trial is given twice, even under two names: pooling it with itself would count its noise
-    as independent evidence.
-    """
+    """The trials' paths, `FILE#NAME` for each recording of a file with several. InputError if a trial is
+    given twice, even under two names: pooling it with itself would count its noise as independent
+    evidence."""
     seen: dict[str, Path] = {}
     out: list[Path] = []
     for given in paths:
@@ -239,9 +233,7 @@ NO_HAND = MAPS | {"rate", "gravity"}  # keys that describe no hand
 
 def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
     """Task and rig of these trials: as given, else task.toml and rig.toml in the folder of the first.
-
-    InputError if there is no task, or if one is given as the other.
-    """
+    InputError if there is no task, or if one is given as the other."""
     folder = split_part(trials[0])[0].parent
     found = [folder / name if given is None and (folder / name).is_file() else given
              for given, name in ((task, "task.toml"), (rig, "rig.toml"))]  # fmt: skip

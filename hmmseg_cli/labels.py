@@ -174,9 +174,7 @@ def lerobot_files(
     folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]]
 ) -> dict[Path, Callable[[Path], object]]:
     """Files of an annotated copy by their place in its folder, each with a function that writes it to a path.
-
-    Episodes without labels get no subtasks. Videos are not copied.
-    """
+    Episodes without labels get no subtasks. Videos are not copied."""
     from hmmseg.io.formats.lerobot import EVENTS, PERSISTENT, data_files, read_info, read_subtasks
 
     info = read_info(folder)

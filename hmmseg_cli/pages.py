@@ -122,12 +122,9 @@ SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # 
 
 @dataclass(frozen=True)
 class Setting:
-    """Contents of a page apart from the body.
-
-    `files`: recordings; `rig`: its pads; `measured`: independent values of properties; `shows`: signature of
-    each effect; `own`: by part of a robot, the unit in which its logs give a quantity that they do not give
-    in SI; `motion`: place of the motion to run next.
-    """
+    """Contents of a page apart from the body. `files`: recordings; `rig`: its pads; `measured`: independent
+    values of properties; `shows`: signature of each effect; `own`: by part of a robot, the unit in which its
+    logs give a quantity that they do not give in SI; `motion`: place of the motion to run next."""
 
     files: Sequence[str]
     rig: Mapping[str, Any] = field(default_factory=dict)
@@ -286,10 +283,8 @@ def _far(body: Body) -> str:
     if "changes" in body:
         rest = f"old ones leave {plain(s['noise_floor'])}"
         return f"On {s['evaluated_on']} what is missed falls {fall} nats a row; {rest}."
-    text = (
-        f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
-        f"healthy recordings leave {plain(s['noise_floor'])}."
-    )
+    text = (f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
+            f"healthy recordings leave {plain(s['noise_floor'])}.")  # fmt: skip
     if s.get("flexible_ceiling") is not None:
         text += f" A description free of any physics would take {percent(s['flexible_ceiling'])} of the gap."
     return text

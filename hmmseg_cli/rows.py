@@ -31,10 +31,8 @@ def _text(line: bytes) -> str:
 
 
 class Rows:
-    """Rows of a CSV stream as (t, channels in SI units).
-
-    InputError names the column of the header or the row at fault, counted as an editor does.
-    """
+    """Rows of a CSV stream as (t, channels in SI units). InputError names the column of the header or the row
+    at fault, counted as an editor does."""
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
         self._stream, self._number = stream, 0

@@ -34,8 +34,7 @@ class Subtask:
     `state`: the contact state; the paper calls every support the ground. `move`: 0-based index in
     `task.performed` of its move (None in a plain ordered task); a pregrasp belongs to the first move, a
     release to the move it ends. `support`: what the held object touches besides the fingers, None while free
-    or lifted; `beneath`: objects from the support down to the ground.
-    """
+    or lifted; `beneath`: objects from the support down to the ground."""
 
     index: int
     name: str
@@ -75,11 +74,8 @@ def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
 
 
 def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
-    """The ordered subtasks of a task.
-
-    In every move of blocks the hand closes on the object, breaks its support contact or slides it, restores
-    contact at the destination, and opens.
-    """
+    """The ordered subtasks of a task. In every move of blocks the hand closes on the object, breaks its
+    support contact or slides it, restores contact at the destination, and opens."""
     if isinstance(task, SequenceTask):
         return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
     support = dict(task.initial)
@@ -153,8 +149,7 @@ def balance(step: Subtask, loads: int = 1) -> list[Equation]:
     plus that of the grip on it, which is constant throughout one move. Forces: the fingers' net vertical
     force is the weight less the support's load, their net horizontal force is the support's push. Slipping:
     push = friction x load (Coulomb), linearised about given loads; their values are arbitrary, distinct
-    numbers, as only rank matters.
-    """
+    numbers, as only rank matters."""
     if step.state == FREE or step.object is None:
         return []
     index, name, grasp = step.index, step.object, str(step.move)
@@ -183,11 +178,8 @@ def _equation(unknowns: Mapping[Unknown, int], measured: Source) -> Equation:
 
 
 def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> dict[Unknown, Row[Source]]:
-    """Unknowns that the equations determine, each as a combination of sources.
-
-    An unknown is in the row space on its own exactly if its pivot row contains no other. `known` unknowns are
-    given.
-    """
+    """Unknowns that the equations determine, each as a combination of sources. An unknown is in the row space
+    on its own exactly if its pivot row contains no other. `known` unknowns are given."""
 
     def unknown(row: Equation) -> list[Unknown]:
         return [key for key in row if not isinstance(key, Source)]
@@ -204,11 +196,9 @@ def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One way to learn a property: the signals of the subtasks required together.
-
-    `bound`: only a lower bound (a friction coefficient without slip). `given`: properties, determined
-    elsewhere, that are required. `condition`: what the recording must show in addition, if anything.
-    """
+    """One way to learn a property: the signals of the subtasks required together. `bound`: only a lower bound
+    (a friction coefficient without slip). `given`: properties, determined elsewhere, that are required.
+    `condition`: what the recording must show in addition, if anything."""
 
     sources: tuple[Source, ...]
     bound: bool = False
@@ -234,11 +224,9 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Property:
-    """A property of an object: every way to learn it, or the reason why there is none.
-
-    Each of `evidence` suffices by itself, the strongest first. `name` is weight, width, height, friction (of
-    the fingers on the object) or friction_on_SUPPORT.
-    """
+    """A property of an object: every way to learn it, or the reason why there is none. Each of `evidence`
+    suffices by itself, the strongest first. `name` is weight, width, height, friction (of the fingers on the
+    object) or friction_on_SUPPORT."""
 
     object: str
     name: str
@@ -283,11 +271,9 @@ class Decomposition(Tabled):
         return sorted(pairs, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
 
     def in_paper(self, index: int, entry: Property) -> bool:
-        """Whether the paper's Table 1 would list the property for this subtask.
-
-        It reads weight and width only while an object is held above the ground, and mentions friction with a
-        support only in sliding contact (its Sections 2.1 and 3.2).
-        """
+        """Whether the paper's Table 1 would list the property for this subtask. It reads weight and width
+        only while an object is held above the ground, and mentions friction with a support only in sliding
+        contact (its Sections 2.1 and 3.2)."""
         state = self.subtasks[index].state
         if entry.name in (WEIGHT, WIDTH):
             return state == ABOVE_GROUND
@@ -476,11 +462,9 @@ def _learn_within(alike: list[list[Subtask]], learned: dict[Unknown, list[Eviden
 
 
 def _learn_friction(step: Subtask, learned: dict[Unknown, list[Evidence]]) -> None:
-    """Friction at the contacts of one subtask, determined where the contact forces are known.
-
-    A fingertip's forces are measured; a support's follow from the balance once the weight is given. Slip
-    determines the coefficient, sticking bounds it from below.
-    """
+    """Friction at the contacts of one subtask, determined where the contact forces are known. A fingertip's
+    forces are measured; a support's follow from the balance once the weight is given. Slip determines the
+    coefficient, sticking bounds it from below."""
     forces, name = (Source(step.index, X_FORCES), Source(step.index, Y_FORCES)), str(step.object)
     learned.setdefault((FRICTION, name), []).append(Evidence(forces, bound=True))
     if step.support is None:

@@ -145,10 +145,8 @@ def direction(axis: str) -> Any:
 
 
 class Finger(StrictTable):
-    """One planar two-link finger with absolute link angles (parallelogram linkage).
-
-    tip = base + L1 (cos q1, sin q1) + L2 (cos q2, sin q2), all in m.
-    """
+    """One planar two-link finger with absolute link angles (parallelogram linkage). tip = base + L1 (cos q1,
+    sin q1) + L2 (cos q2, sin q2), all in m."""
 
     base: tuple[Finite, Finite]
     links: tuple[Link, Link]
@@ -162,11 +160,9 @@ class Fingertip(StrictTable):
 
 
 class Noise(StrictTable):
-    """Noise standard deviations of one sample; None is learned from the recording.
-
-    `angle` [rad] and `velocity` [rad/s] of a jointed hand, `position` [m] and `velocity` [m/s] of a Cartesian
-    one, and `force` [N] of both.
-    """
+    """Noise standard deviations of one sample; None is learned from the recording. `angle` [rad] and
+    `velocity` [rad/s] of a jointed hand, `position` [m] and `velocity` [m/s] of a Cartesian one, and `force`
+    [N] of both."""
 
     angle: FinitePositive | None = None
     position: FinitePositive | None = None
@@ -204,8 +200,7 @@ class Systematic(StrictTable):
 
     `force_bias` [N] and `force_gain` (relative) per finger and axis (fx1, fy1, fx2, fy2), `joint_offset`
     [rad] per joint (q11, q12, q21, q22), `link_length` per link (finger 1's two, then finger 2's) and
-    `pad_stiffness` per finger, both relative.
-    """
+    `pad_stiffness` per finger, both relative."""
 
     force_bias: Annotated[_Four, _per_entry(FORCE_CHANNELS)] = (0.0, 0.0, 0.0, 0.0)
     force_gain: Annotated[_Four, _per_entry(FORCE_CHANNELS)] = (0.0, 0.0, 0.0, 0.0)

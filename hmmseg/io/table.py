@@ -139,10 +139,8 @@ def holds_text(values: np.ndarray) -> bool:
 
 
 def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
-    """A column of times (num_rows,) [s], and where its zero lies in ns since 1970 if it holds dates.
-
-    ISO 8601 stamps and dates become s since the first; numbers stay as they are.
-    """
+    """A column of times (num_rows,) [s], and where its zero lies in ns since 1970 if it holds dates. ISO 8601
+    stamps and dates become s since the first; numbers stay as they are."""
     column = table.columns[name]
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.float64) * 1e-9, None

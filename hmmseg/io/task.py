@@ -53,10 +53,8 @@ class Task:
 
 @dataclass(frozen=True)
 class BlockTask(Task):
-    """Blocks, what each stands on at the start, and the moves in order.
-
-    `repeat`: how many times the list of moves is performed; "unknown": as often as the recording shows.
-    """
+    """Blocks, what each stands on at the start, and the moves in order. `repeat`: how many times the list of
+    moves is performed; "unknown": as often as the recording shows."""
 
     initial: dict[str, str]
     moves: tuple[Move, ...]
@@ -75,10 +73,8 @@ class BlockTask(Task):
 
 @dataclass(frozen=True)
 class SequenceTask(Task):
-    """A plain ordered task: named states over arbitrary channels, without block physics.
-
-    `channels` None means every column but `t`; states in `optional` may be skipped.
-    """
+    """A plain ordered task: named states over arbitrary channels, without block physics. `channels` None
+    means every column but `t`; states in `optional` may be skipped."""
 
     sequence: tuple[str, ...]
     channels: tuple[str, ...] | None = None
@@ -212,11 +208,8 @@ def _parse_move(number: int, entry: Any, where: str) -> Move:
 
 
 def _check_moves(task: BlockTask, where: str) -> None:
-    """Simulate the moves; InputError with the number of the first impossible one.
-
-    An unknown number of rounds is simulated until an arrangement of the objects recurs: nothing new can
-    happen from there on.
-    """
+    """Simulate the moves; InputError with the number of the first impossible one. An unknown number of rounds
+    is simulated until an arrangement of the objects recurs: nothing new can happen from there on."""
     support, seen = dict(task.initial), [dict(task.initial)]
     for round_ in range(1, (MAX_REPEAT if task.repeat == "unknown" else task.repeat) + 1):
         for number, move in enumerate(task.moves, 1):

@@ -70,10 +70,8 @@ def name_spans(ax: Axes, segmentation: Segmentation) -> None:
 
 
 def draw_signals(signals: Signals, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
-    """Plot mean position, finger distance, grip, net and shear forces over coloured subtasks.
-
-    After the paper's Figures 5 to 7.
-    """
+    """Plot mean position, finger distance, grip, net and shear forces over coloured subtasks. After the
+    paper's Figures 5 to 7."""
     panels = {
         "Mean $x$\n[cm]": 100 * signals.x,
         "Mean $y$\n[cm]": 100 * signals.y,

@@ -39,11 +39,9 @@ def canvas(
     height: float = 3.0,
     layout: Literal["constrained"] | None = "constrained",
 ) -> Iterator[Figure]:
-    """An empty figure of this size [in], saved to `path` (kind by its suffix) when the block ends.
-
-    Without pyplot: nothing stays open and no display is needed. Without a path the caller shows the figure;
-    in a notebook, or if a script has loaded pyplot, it is one of pyplot's.
-    """
+    """An empty figure of this size [in], saved to `path` (kind by its suffix) when the block ends. Without
+    pyplot: nothing stays open and no display is needed. Without a path the caller shows the figure; in a
+    notebook, or if a script has loaded pyplot, it is one of pyplot's."""
     with matplotlib.rc_context(STYLE):
         if path is None and not sys.modules.keys().isdisjoint(("matplotlib.pyplot", "ipykernel")):
             from matplotlib import pyplot

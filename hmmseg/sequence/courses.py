@@ -32,11 +32,9 @@ MAX_BLOCKS = 250  # numerics: the cost table is quadratic in this
 def partition(
     values: np.ndarray, num_stretches: int, floor: float, cuts: Sequence[int] | np.ndarray = ()
 ) -> np.ndarray:
-    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 with the least total cost.
-
-    A stretch of n blocks costs n/2 log(variance + floor^2) per column of `values` (num_cells, num_features),
-    which must be finite; no stretch crosses the cells `cuts`. ValueError for fewer cells than stretches.
-    """
+    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 with the least total cost. A stretch of n
+    blocks costs n/2 log(variance + floor^2) per column of `values` (num_cells, num_features), which must be
+    finite; no stretch crosses the cells `cuts`. ValueError for fewer cells than stretches."""
     num_cells = len(values)
     if num_cells < num_stretches:
         raise ValueError(f"{num_cells} cells, expected at least {num_stretches}")
@@ -61,9 +59,7 @@ def partition(
 
 def pooled_costs(count: np.ndarray, first: np.ndarray, second: np.ndarray, floor: float) -> np.ndarray:
     """Cost [a, b] (N + 1, N + 1) of merging the parts a <= k < b into one stretch, inf for an empty one.
-
-    `count` (N,): cells in each part; `first`, `second` (N, num_features): sums of values and of squares.
-    """
+    `count` (N,): cells in each part; `first`, `second` (N, num_features): sums of values and of squares."""
     n, x, x2 = (np.concatenate([np.zeros((1, *v.shape[1:])), np.cumsum(v, axis=0)])
                 for v in (count.astype(float), first, second))  # fmt: skip
     number = n[None] - n[:, None]
@@ -109,11 +105,9 @@ class Course:
 
 
 def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
-    """Distinct courses of trials `values` [(num_cells, num_features), ...] on a coarse grid.
-
-    `labels` [(num_states - 1,), ...]: known boundaries as shares of each trial, NaN where unknown. Labelled
-    trials are tried first as starts, with stretches that end at the labels.
-    """
+    """Distinct courses of trials `values` [(num_cells, num_features), ...] on a coarse grid. `labels`
+    [(num_states - 1,), ...]: known boundaries as shares of each trial, NaN where unknown. Labelled trials are
+    tried first as starts, with stretches that end at the labels."""
     most = max(num_states, min(map(len, values)) // 2)
     numbers = dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES)
     labelled = [i for i, known in enumerate(labels) if np.isfinite(known).any()]
@@ -153,11 +147,9 @@ def _learn_course(
 
 
 def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, share: float) -> np.ndarray:
-    """Log probability (number - 1,) that each change is real, against one state on both sides of it.
-
-    By `share` independent observations per cell: each side has its own mean and variance per channel (Schwarz
-    criterion), and the change is equally likely between any two cells of a trial.
-    """
+    """Log probability (number - 1,) that each change is real, against one state on both sides of it. By
+    `share` independent observations per cell: each side has its own mean and variance per channel (Schwarz
+    criterion), and the change is equally likely between any two cells of a trial."""
     bridged = [np.arcsinh(fill_gaps(v)) for v in values]
     stacked, path = np.vstack(bridged), np.concatenate(paths)
     features = stacked.shape[1]
@@ -262,10 +254,8 @@ class Choice:
 def naming(
     course: Course, num_states: int, labels: Sequence[np.ndarray], weighing: Weighing = WEIGHING
 ) -> Naming:
-    """Sum over all choices of `num_states` - 1 >= 1 boundaries among the changes of a course.
-
-    `labels` [(num_states - 1,), ...]: known boundaries of each trial as shares of it, NaN where unknown.
-    """
+    """Sum over all choices of `num_states` - 1 >= 1 boundaries among the changes of a course. `labels`
+    [(num_states - 1,), ...]: known boundaries of each trial as shares of it, NaN where unknown."""
     # Log weights: groups [a, b] of stretches a <= k < b as one named state; tail [a] of those from a on as
     # the last one, and end [a, e] with a settled state from e on; change of a change that ends a state.
     temper = weighing.independent * course.share / (weighing.independent + course.observations)

@@ -47,11 +47,9 @@ class StudentEmissions:
 
 def update(emissions: StudentEmissions, values: np.ndarray, weights: np.ndarray,
            floor: float) -> StudentEmissions:  # fmt: skip
-    """One EM step for location and scale (Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 1989).
-
-    `values` (num_cells, num_features) of all trials; `weights` (num_cells, num_states): posterior state
-    probabilities; scales are at least `floor`.
-    """
+    """One EM step for location and scale (Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 1989). `values`
+    (num_cells, num_features) of all trials; `weights` (num_cells, num_states): posterior state probabilities;
+    scales are at least `floor`."""
     loc, scale = emissions.loc.copy(), emissions.scale.copy()
     known = np.isfinite(values)
     x = np.where(known, values, 0.0)
@@ -154,11 +152,9 @@ def _windows(values: np.ndarray, half: int) -> np.ndarray:
 
 
 def learn(trials: Sequence[np.ndarray], edges: Sequence[np.ndarray], half: int) -> Detectors:
-    """Templates from channels [(num_cells, num_channels), ...] and labelled edges.
-
-    `edges[i][b]`: the cell before boundary b of trial i; -1 where the boundary has no course of its own (a
-    skipped subtask). A boundary that no trial has gets ratio 0 everywhere.
-    """
+    """Templates from channels [(num_cells, num_channels), ...] and labelled edges. `edges[i][b]`: the cell
+    before boundary b of trial i; -1 where the boundary has no course of its own (a skipped subtask). A
+    boundary that no trial has gets ratio 0 everywhere."""
     windows = [_windows(values, half) for values in trials]
     usual = np.sqrt(np.nanmean(np.vstack(windows) ** 2, axis=(0, 1)))
     usual = np.maximum(np.nan_to_num(usual), 1e-6)
@@ -182,10 +178,8 @@ def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence
 
 
 def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
-    """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary added.
-
-    A path that skips a state crosses both its boundaries.
-    """
+    """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary added. A path that
+    skips a state crosses both its boundaries."""
     total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
     stay, *jumps = chain.bands
     advance, *skips = (
@@ -273,10 +267,8 @@ def weigh(values: np.ndarray, emissions: StudentEmissions, law: Chain,
 
 
 def durations(probability: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean durations [cells] and presence (num_states,), from posterior state probabilities.
-
-    Presence has a Beta(1, 1) prior.
-    """
+    """Mean durations [cells] and presence (num_states,), from posterior state probabilities. Presence has a
+    Beta(1, 1) prior."""
     visited = np.array([p.max(0) for p in probability])
     cells = np.sum([p.sum(0) for p in probability], 0) / np.maximum(visited.sum(0), 0.5)
     return np.maximum(cells, LEAST_CELLS), (visited.sum(0) + 1) / (len(probability) + 2)

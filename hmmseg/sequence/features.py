@@ -22,11 +22,9 @@ SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's durat
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """From channels to features, fixed once for all trials of a model.
-
-    `step` [s]: width of a cell; `window` [cells]: width of slopes; `center`, `scale` (num_features,):
-    standardisation, the values of all channels first, then their slopes.
-    """
+    """From channels to features, fixed once for all trials of a model. `step` [s]: width of a cell; `window`
+    [cells]: width of slopes; `center`, `scale` (num_features,): standardisation, the values of all channels
+    first, then their slopes."""
 
     channels: tuple[str, ...]
     step: float
@@ -54,9 +52,7 @@ class SequenceFeatures:
 
 def drop_repeats(values: np.ndarray) -> np.ndarray:
     """A channel (num_timesteps,) without repeated readings (NaN) if it is sampled at a lower rate than rows.
-
-    That is so where no two consecutive samples both change: each repeats the last reading.
-    """
+    That is so where no two consecutive samples both change: each repeats the last reading."""
     changes = np.flatnonzero(np.diff(values) != 0) + 1
     if changes.size < FEWEST or (period := int(np.diff(changes).min())) < 2:
         return values
@@ -67,9 +63,7 @@ def drop_repeats(values: np.ndarray) -> np.ndarray:
 
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
     """Edges (num_cells + 1,) and mean of each channel (num_cells, num_channels), NaN in empty cells.
-
-    InputError where the trial lacks a channel.
-    """
+    InputError where the trial lacks a channel."""
     for name in channels:
         if name not in trial.channels:
             raise InputError(trial.file, f"has no channel {name}", f"channels {', '.join(channels)}")
@@ -93,10 +87,8 @@ def fill_gaps(x: np.ndarray) -> np.ndarray:
 
 def edge_preserving_slopes(x: np.ndarray, window: int) -> np.ndarray:
     """Slope (num_cells, num_channels) by least squares over `window` cells before, around or after each cell.
-
     Of the three windows the one with the best linear fit is used (Kuwahara et al., Digital Processing of
-    Biomedical Images, 1976), so that no slope extends across a jump.
-    """
+    Biomedical Images, 1976), so that no slope extends across a jump."""
     num_cells = len(x)
     window = min(window, num_cells)
     if window < 2:

@@ -224,9 +224,7 @@ def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
 
 def label_constraints(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
     """Log weights (num_cells, num_states) that keep labelled boundaries [s] within a cell; None without any.
-
-    -inf where a label forbids a state, 0 elsewhere.
-    """
+    -inf where a label forbids a state, 0 elsewhere."""
     if not np.isfinite(boundaries).any():
         return None
     reach, out = trial.edges[1] - trial.edges[0], np.zeros((len(trial.middle), num_states))
@@ -238,10 +236,8 @@ def label_constraints(trial: SequenceFeatures, boundaries: np.ndarray, num_state
 
 def choose_detectors(taught: Learner, data: Sequence[SequenceFeatures], boundaries: Sequence[np.ndarray],
                      paths: Sequence[np.ndarray], temper: float, law: Chain) -> Detectors:  # fmt: skip
-    """Detectors whose window and weights place held-out labels best (leave-one-trial-out).
-
-    The score is the log probability within a cell of the label, which penalises overconfident weights.
-    """
+    """Detectors whose window and weights place held-out labels best (leave-one-trial-out). The score is the
+    log probability within a cell of the label, which penalises overconfident weights."""
     channels = [v[:, : v.shape[1] // 2] for v in taught.values]
     cells = [np.searchsorted(d.middle, b, side="right") - 1 for d, b in zip(data, boundaries, strict=True)]
     shown = [_shown(each) for each in cells]

@@ -41,10 +41,8 @@ SQUEEZED = 0.03  # chosen: share of the typical duration
 @dataclass(frozen=True)
 class NamedCourse:
     """A course (`hmmseg.sequence.courses`) on the fine grid, and which of its changes are the boundaries.
-
     `probability`: of the course; `naming` (num_boundaries, num_changes): that boundary b is change j, summing
-    to 1 over j; `shift` (num_boundaries, num_changes) [cells]: mean lag of labelled boundaries behind it.
-    """
+    to 1 over j; `shift` (num_boundaries, num_changes) [cells]: mean lag of labelled boundaries behind it."""
 
     probability: float
     emissions: StudentEmissions
@@ -131,10 +129,8 @@ class SequenceModel(Tabled):
         return log_likelihoods, np.full(num_states, -np.log(num_states)), transition
 
     def failure(self, trial: SequenceFeatures) -> Failure | None:
-        """The first subtask at which a trial leaves the task; None where it fits.
-
-        The first subtask may be cropped to any length and is not tested for being squeezed.
-        """
+        """The first subtask at which a trial leaves the task; None where it fits. The first subtask may be
+        cropped to any length and is not tested for being squeezed."""
         names, optional = self.task.sequence, optional_states(self.task, settled=False)
         scores, ll, alignment = self.misfit(trial)
         cells = alignment.smoothed.sum(axis=0)
@@ -160,10 +156,8 @@ def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
 
 
 def usual_misfit(scores: Sequence[np.ndarray]) -> np.ndarray:
-    """Median and width (2, 2) of each score [(2,), ...] over the training trials.
-
-    The width is widened by 1 + FEW / their number, as that of few trials is uncertain itself.
-    """
+    """Median and width (2, 2) of each score [(2,), ...] over the training trials. The width is widened by 1 +
+    FEW / their number, as that of few trials is uncertain itself."""
     center = np.median(scores, axis=0)
     width = NORMAL * np.median(np.abs(np.array(scores) - center), axis=0)
     return np.column_stack([center, np.maximum(width, LEAST_WIDTH) * (1 + FEW / len(scores))])

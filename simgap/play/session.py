@@ -46,11 +46,9 @@ def default_task(objects: list[str]) -> BlockTask:
 
 
 class Session:
-    """The nominal world, optionally a second one, and the hand that both follow.
-
-    `aim` (the hand's middle, closed or open) or `touch` (each finger) sets the target, `advance` lets time
-    pass, `frame` gives the current state, and `save` writes what was recorded since `reset`.
-    """
+    """The nominal world, optionally a second one, and the hand that both follow. `aim` (the hand's middle,
+    closed or open) or `touch` (each finger) sets the target, `advance` lets time pass, `frame` gives the
+    current state, and `save` writes what was recorded since `reset`."""
 
     def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, seed: int = 0) -> None:
         self.task, self.rig, self.blocks, self.seed = task, rig, blocks, seed
@@ -153,10 +151,8 @@ class Session:
 
     def save(self, folder: Path) -> list[Path]:
         """Save the nominal world's recording as the next trial_NN.csv, with rig, task and true properties.
-
         ValueError if it is shorter than a second, InputError if the folder belongs to another session.
-        Existing files are never replaced.
-        """
+        Existing files are never replaced."""
         rows = np.array(self._rows)
         if len(rows) < 1000:
             raise ValueError("less than a second has been recorded")

@@ -35,9 +35,7 @@ def felt_effects() -> dict[str, HandEffect]:
 
 def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[str, float]:
     """Parameters of an effect, as given; by default those of its first form, strong enough to be felt.
-
-    InputError for an unknown effect.
-    """
+    InputError for an unknown effect."""
     known = felt_effects()
     if name not in known:
         raise InputError(f"effect {name}", "cannot be felt in a played world", nearest(name, known))
@@ -78,9 +76,7 @@ WINDOW = 600  # look: ms of motion that a sensor effect can look back on
 
 class PlayedWorld:
     """Blocks and two fingertips; `advance` moves them by a millisecond under commanded finger positions.
-
-    `position`, `velocity`, `force` (2 fingers, 2 axes) [m, m/s, N] of the tips, forces on the blocks.
-    """
+    `position`, `velocity`, `force` (2 fingers, 2 axes) [m, m/s, N] of the tips, forces on the blocks."""
 
     def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, x: Mapping[str, float], start: np.ndarray,
                  effects: Values | None = None) -> None:  # fmt: skip

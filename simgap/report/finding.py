@@ -284,10 +284,8 @@ def remains(body: Body) -> list[str]:
         return [f"Under 1 % of the gap remains{sure}, which is more than noise.{size}"]
     if _noise(rest):
         return [f"What remains, {percent(rest['share'])} of the gap, is within the noise{sure}.{size}"]
-    return [
-        f"{percent(rest['share'])} of the gap remains{sure}.{size}",
-        *moving({"where": rest.get("where") or []}, of="what remains"),
-    ]
+    return [f"{percent(rest['share'])} of the gap remains{sure}.{size}",
+            *moving({"where": rest.get("where") or []}, of="what remains")]  # fmt: skip
 
 
 def _noise(rest: Mapping[str, Any]) -> bool:
@@ -304,10 +302,8 @@ def settles(body: Body, weighed: bool) -> str:
     )
     if weighed or not unsure or not any(e.get("property_shift") for e in body["effects"].values()):
         return ""
-    return (
-        "Weigh and measure the blocks and pass them with --actual: a sensor error can hide in a "
-        "fitted weight or size."
-    )
+    return ("Weigh and measure the blocks and pass them with --actual: a sensor error can hide in a "
+            "fitted weight or size.")  # fmt: skip
 
 
 def chances(body: Body) -> dict[str, float]:

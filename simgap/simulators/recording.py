@@ -21,10 +21,8 @@ from hmmseg.io.units import Column
 
 @dataclass(frozen=True)
 class Recording:
-    """Times `t` (num_timesteps,) [s] and `columns` by name, from row `first` of a whole log.
-
-    NaN is a missing sample. `recording["q1"]` is a column; `warnings` tell what was left out of its file.
-    """
+    """Times `t` (num_timesteps,) [s] and `columns` by name, from row `first` of a whole log. NaN is a missing
+    sample. `recording["q1"]` is a column; `warnings` tell what was left out of its file."""
 
     name: str
     t: np.ndarray
@@ -91,8 +89,7 @@ def _on_one_clock(log: Recording, commands: Collection[str], acts: str | None) -
 
     Slower columns are interpolated like topics of a log, at the rows nearest to their own samples: more would
     count noise twice. Commands count with their mean until the next row; or, where all are given together and
-    at most once a row, as they are, from when they were given.
-    """
+    at most once a row, as they are, from when they were given."""
     rows = {name: np.flatnonzero(np.isfinite(values)) for name, values in log.columns.items()}
     if all(np.median(np.diff(each)) <= 1 for each in rows.values() if each.size > 1):
         return log

@@ -93,11 +93,9 @@ class _Late(BaseException):
 
 @contextmanager
 def calling(where: str, file: str, expected: str = "", patience: float = PATIENCE) -> Iterator[None]:
-    """Run a user's code: whatever it raises becomes an InputError with the line of its `file`.
-
-    So does a call of more than `patience` [s], where it runs Python in the main thread of a POSIX system. An
-    interrupt stays one.
-    """
+    """Run a user's code: whatever it raises becomes an InputError with the line of its `file`. So does a call
+    of more than `patience` [s], where it runs Python in the main thread of a POSIX system. An interrupt stays
+    one."""
     timed = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
 
     def late(*_: Any) -> None:
@@ -134,11 +132,8 @@ def _line(error: BaseException, where: str, file: str) -> str:
 
 @dataclass(frozen=True)
 class Checks:
-    """Checked calls of a user's functions.
-
-    `where` they are named, their `file`, `patience` [s] with a call, and the `channels` that a run must
-    return.
-    """
+    """Checked calls of a user's functions. `where` they are named, their `file`, `patience` [s] with a call,
+    and the `channels` that a run must return."""
 
     where: str
     file: str

@@ -35,8 +35,7 @@ def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) ->
     `depth` [m] is positive inside, `rate` [m/s] is its time derivative. A Kelvin-Voigt element whose damping
     [N s/m] fades in with depth, as in Hunt & Crossley, "Coefficient of restitution interpreted as damping in
     vibroimpact", J. Appl. Mech. 42 (1975): constant damping would make the force jump at touch and pull at
-    separation.
-    """
+    separation."""
     depth = jnp.maximum(depth, 0.0)
     faded = damping * jnp.minimum(depth / FADE, 1.0)
     return jnp.maximum(stiffness * depth + faded * rate, 0.0)
@@ -50,8 +49,7 @@ def friction(stiffness: Array, damping: Array, deflection: Array, rate: Array,
     times normal force) holds at a constant deflection forever. Beyond the bound the anchor is dragged along
     so that the spring carries exactly the bound (elastic predictor and return mapping: Simo & Hughes,
     Computational Inelasticity, 1998, chapter 1; the contact model of Cundall & Strack, Géotechnique 29,
-    1979). Without contact the deflection is 0.
-    """
+    1979). Without contact the deflection is 0."""
     limit = bound / stiffness
     deflection = jnp.clip(deflection, -limit, limit)
     return jnp.clip(stiffness * deflection + damping * rate, -bound, bound), deflection
@@ -66,11 +64,10 @@ EDGE = 1e-3  # numerics: m; length over which a contact fades at the end of a fa
 class Physics(NamedTuple):
     """All constants of a scene, a pytree of scalars; effects and gradients act on it.
 
-    Per block: `weight` [N], `width`, `height` [m] and `friction` against a pad. Per finger:
-    `pad_normal`, `pad_shear` [N/m]. `pad_time` [s] is damping over stiffness of the foam.
-    Supports (ground and block on block): `support_stiffness` [N/m] along and across,
-    `support_damping` (ratio to critical) and `support_friction`. `tilt` [rad] inclines the ground.
-    """
+    Per block: `weight` [N], `width`, `height` [m] and `friction` against a pad. Per finger: `pad_normal`,
+    `pad_shear` [N/m]. `pad_time` [s] is damping over stiffness of the foam. Supports (ground and block on
+    block): `support_stiffness` [N/m] along and across, `support_damping` (ratio to critical) and
+    `support_friction`. `tilt` [rad] inclines the ground."""
 
     weight: Scalars
     width: Scalars
@@ -87,11 +84,9 @@ class Physics(NamedTuple):
 
 
 class State(NamedTuple):
-    """Centres and velocities of the blocks (num_blocks each), and the anchors of all contacts.
-
-    Anchors are the relative tangential positions [m] at which a contact carries no shear: `pads` (2 x
-    num_blocks), `ground` (num_blocks) and `pairs` (one per pair of blocks).
-    """
+    """Centres and velocities of the blocks (num_blocks each), and the anchors of all contacts. Anchors are
+    the relative tangential positions [m] at which a contact carries no shear: `pads` (2 x num_blocks),
+    `ground` (num_blocks) and `pairs` (one per pair of blocks)."""
 
     x: Scalars
     y: Scalars
@@ -127,12 +122,9 @@ Values = Any  # a jax Array in compiled code, a NumPy array after it
 
 
 class Record(NamedTuple):
-    """A rollout, one row per control period; F fingers (2), B blocks.
-
-    Tips: `position`, `velocity`, `force` (T, F, 2) [m, m/s, N], x and y last. Blocks: `blocks` and
-    `block_velocity` (T, B, 2) [m, m/s]. Normal forces `pads` (T, F, B) [N], forces from beneath `support`
-    (T, B) [N].
-    """
+    """A rollout, one row per control period; F fingers (2), B blocks. Tips: `position`, `velocity`, `force`
+    (T, F, 2) [m, m/s, N], x and y last. Blocks: `blocks` and `block_velocity` (T, B, 2) [m, m/s]. Normal
+    forces `pads` (T, F, B) [N], forces from beneath `support` (T, B) [N]."""
 
     position: Values
     velocity: Values
@@ -254,8 +246,7 @@ def substep(physics: Physics, state: State, tips: Tips, h: Scalar) -> State:
 
     The position form of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical Integration,
     2006, section I.1): second order, symplectic without dissipation, one force evaluation per step. Stable
-    for h times the fastest frequency below 2.
-    """
+    for h times the fastest frequency below 2."""
     state, loads = interact(physics, drift(state, h / 2), tips)
     return drift(kick(physics, state, loads, h), h / 2)
 
@@ -387,10 +378,8 @@ class Impedance(NamedTuple):
 
 @partial(jax.jit, static_argnames=("substeps",))
 def perform(physics: Physics, hand: Impedance, command: Array, state: State, substeps: int) -> Record:
-    """Perform a commanded motion: `command` (T, 4) is x1, y1, x2, y2 [m] per control period.
-
-    Tips start at rest at the first command. Commands are interpolated linearly.
-    """
+    """Perform a commanded motion: `command` (T, 4) is x1, y1, x2, y2 [m] per control period. Tips start at
+    rest at the first command. Commands are interpolated linearly."""
     h = CONTROL_PERIOD / substeps
     slope = jnp.diff(command, axis=0, append=command[-1:]) / CONTROL_PERIOD
     start = tips_of(jnp.concatenate([command[0], jnp.zeros(4)]))

@@ -48,8 +48,7 @@ class OperatorSettings(StrictTable):
 
     Times [s], lengths [m], forces [N]; `pace` divides all durations. Drawn once per trial: the hand's
     `hand_stiffness` [N/m], `hand_mass` [kg] and `hand_damping` (ratio), the `offset` between the fingers'
-    heights, and the rms `tremor` and `wander` of each tip.
-    """
+    heights, and the rms `tremor` and `wander` of each tip."""
 
     grip: Above = (2.0, 3.2)
     press: Range = (0.9, 1.9)
@@ -102,11 +101,9 @@ class Window:
 
 @dataclass(frozen=True)
 class Plan:
-    """Commanded tips (num_periods, 4): x1, y1, x2, y2 [m], one row per control period.
-
-    `impedance` of the hand is (mass [kg], stiffness [N/m], damping [N s/m]), `start` the initial centre of
-    every block [m], `duration` [s] of the trial.
-    """
+    """Commanded tips (num_periods, 4): x1, y1, x2, y2 [m], one row per control period. `impedance` of the
+    hand is (mass [kg], stiffness [N/m], damping [N s/m]), `start` the initial centre of every block [m],
+    `duration` [s] of the trial."""
 
     command: np.ndarray
     impedance: tuple[float, float, float]

@@ -37,11 +37,8 @@ AGREEMENT = 1.5  # chosen: standard deviations within which a wider window must 
 
 @dataclass(frozen=True)
 class Motion:
-    """Smoothed motion of several axes at times `t` (T,) [s].
-
-    `position`, `velocity` (T, axes) [m, m/s], and the position's `sd` (T, axes) [m], inf where a gap in the
-    samples was only interpolated.
-    """
+    """Smoothed motion of several axes at times `t` (T,) [s]. `position`, `velocity` (T, axes) [m, m/s], and
+    the position's `sd` (T, axes) [m], inf where a gap in the samples was only interpolated."""
 
     t: np.ndarray
     position: np.ndarray
@@ -57,10 +54,8 @@ class Motion:
 
 def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_position: np.ndarray,
            sd_velocity: np.ndarray) -> Motion:  # fmt: skip
-    """Smooth samples (T, axes) of position [m] and velocity [m/s], NaN where missing.
-
-    `sd_*` (T, axes) is the noise of one sample.
-    """
+    """Smooth samples (T, axes) of position [m] and velocity [m/s], NaN where missing. `sd_*` (T, axes) is the
+    noise of one sample."""
     weights = [np.where(np.isfinite(z), 1.0 / (TOLERANCE * sd), 0.0)
                for z, sd in ((position, sd_position), (velocity, sd_velocity))]  # fmt: skip
     samples = [np.nan_to_num(position), np.nan_to_num(velocity)]
@@ -87,11 +82,9 @@ def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_positio
 
 def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray], before: int,
              after: int) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Fit a parabola about every sample, over the given numbers of samples before and after it.
-
-    Returns position, velocity and variance (T, axes, 3) at the sample, and whether the data accept the window
-    (T, axes). A window with one neighbour is always accepted: there is no narrower one.
-    """
+    """Fit a parabola about every sample, over the given numbers of samples before and after it. Returns
+    position, velocity and variance (T, axes, 3) at the sample, and whether the data accept the window (T,
+    axes). A window with one neighbour is always accepted: there is no narrower one."""
     n = t.size
     rows = np.arange(n)[:, None] + np.arange(-before, after + 1)
     inside = (rows >= 0) & (rows < n)
@@ -133,11 +126,9 @@ TO_TIPS = np.linalg.inv(TO_MEAN)
 
 @dataclass(frozen=True)
 class Replay:
-    """Predictions for one recording; T samples, 2 fingers, axes x and y last.
-
-    `force` (T, 2, 2) [N] is predicted at the samples, `measured` (T, 2, 2) [N] recorded; `motion` is the
-    whole rollout at 1 kHz, at times `t` [s].
-    """
+    """Predictions for one recording; T samples, 2 fingers, axes x and y last. `force` (T, 2, 2) [N] is
+    predicted at the samples, `measured` (T, 2, 2) [N] recorded; `motion` is the whole rollout at 1 kHz, at
+    times `t` [s]."""
 
     signals: Signals
     force: np.ndarray
@@ -161,10 +152,8 @@ class Replay:
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            ) -> Replay:  # fmt: skip
-    """Drive the calibrated model with the motion of a recording.
-
-    `boundaries` [s] between the subtasks locate the blocks; without them the trial is segmented.
-    """
+    """Drive the calibrated model with the motion of a recording. `boundaries` [s] between the subtasks locate
+    the blocks; without them the trial is segmented."""
     signals = task_space(trial, rig)
     if boundaries is None:
         found = segment([trial], task, rig)[0]
@@ -229,11 +218,9 @@ def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarr
 def residual_summary(
     result: Replay, boundaries: Sequence[float] | np.ndarray, states: Sequence[str]
 ) -> dict[str, float]:
-    """Root mean square of the net force residual over its noise, by contact state.
-
-    `states` are those of the subtasks between the `boundaries` [s]; samples within 0.1 s of a boundary are
-    left out. The noise of a net force is sqrt(2) times the sensor's.
-    """
+    """Root mean square of the net force residual over its noise, by contact state. `states` are those of the
+    subtasks between the `boundaries` [s]; samples within 0.1 s of a boundary are left out. The noise of a net
+    force is sqrt(2) times the sensor's."""
     t, net = result.signals.t, result.residual.sum(axis=1) / (np.sqrt(2) * result.signals.sd_force)
     edges = np.concatenate([[t[0] - 1], boundaries, [t[-1] + 1]])
     inside = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(states) - 1)

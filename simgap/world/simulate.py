@@ -50,11 +50,9 @@ DEFAULT_CARTESIAN_VELOCITY = 0.004  # prior: m/s
 
 def record(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig,
            rng: np.random.Generator | None, file: str) -> Trial:  # fmt: skip
-    """Record tips (num_timesteps, 2 fingers, 2 axes) at times t (num_timesteps,) [s].
-
-    Positions [m], velocities [m/s], forces [N] on the environment. Noise as in the rig is drawn from `rng`
-    (none if None). InputError if a tip is beyond the hand's reach.
-    """
+    """Record tips (num_timesteps, 2 fingers, 2 axes) at times t (num_timesteps,) [s]. Positions [m],
+    velocities [m/s], forces [N] on the environment. Noise as in the rig is drawn from `rng` (none if None).
+    InputError if a tip is beyond the hand's reach."""
     channels: dict[str, np.ndarray] = {}
 
     def take(name: str, values: np.ndarray, quantity: str) -> None:
@@ -140,8 +138,7 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
 
     They are integrated together, which costs far less than one after another, with the same result. `alter`
     changes the operator's commands, given a random generator of its own. InputError if a block is missing or
-    out of the hand's reach.
-    """
+    out of the hand's reach."""
     settings = operator or OperatorSettings()
     if not seeds:
         return []
@@ -236,10 +233,8 @@ DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals 
 
 
 def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
-    """Contents of rig.toml, task.toml and actual.toml by file name.
-
-    Trials have the fingertips' own columns, in SI units, whatever those of the rig's recordings are.
-    """
+    """Contents of rig.toml, task.toml and actual.toml by file name. Trials have the fingertips' own columns,
+    in SI units, whatever those of the rig's recordings are."""
     actual = {
         name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
         for name in task.objects

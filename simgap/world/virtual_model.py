@@ -45,11 +45,9 @@ RIGID_PAD = 1e5  # numerics: N/m in place of inf: 3 N of grip compress such a pa
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a rig does not state: supports and the foam's damping.
-
-    Supports are stiff springs [N/m] with damping (ratio to critical for one block) and friction. The foam's
-    damping is given by `pad_time` [s], damping over stiffness, and the ground's slope by `tilt` [rad].
-    """
+    """What a rig does not state: supports and the foam's damping. Supports are stiff springs [N/m] with
+    damping (ratio to critical for one block) and friction. The foam's damping is given by `pad_time` [s],
+    damping over stiffness, and the ground's slope by `tilt` [rad]."""
 
     support_stiffness: float = 4e5
     support_damping: float = 0.5
@@ -78,8 +76,7 @@ def substeps_for(constants: Physics, period: float) -> int:
 
     By Gershgorin's theorem no block oscillates faster than sqrt((4 supports + both pads) / mass), the bound
     in the middle of a stack. The step is at most 1.1 over that frequency (the limit is 2), 0.8 over the pads'
-    damping rate, and 0.25 ms. The number is a power of two, so that few programs are compiled.
-    """
+    damping rate, and 0.25 ms. The number is a power of two, so that few programs are compiled."""
     step = 2.5e-4
     pads = max(sum(map(float, constants.pad_normal)), sum(map(float, constants.pad_shear)))
     for w in constants.weight:

@@ -31,10 +31,8 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of one text file; line numbers count from 0.
-
-    `most`: cells of the longest row, of which those beyond the names are empty. `notes`: what was dropped.
-    """
+    """The layout of one text file; line numbers count from 0. `most`: cells of the longest row, of which
+    those beyond the names are empty. `notes`: what was dropped."""
 
     encoding: str
     separator: str
@@ -171,10 +169,7 @@ def rows_in(path: Path, layout: Layout) -> Iterator[tuple[int, list[str]]]:
 
 def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] | None:
     """The header, if a comment holds it (as `numpy.savetxt` writes it) and `line` is the first row of
-    numbers.
-
-    Comment signs before its first name are not part of the name.
-    """
+    numbers. Comment signs before its first name are not part of the name."""
     cells = cells_of(line, separator)
     if not _numeric(cells):
         return None

@@ -47,11 +47,9 @@ Message = tuple[str, int, Callable[[], Any]]  # topic, when it was logged [ns si
 
 @dataclass
 class Stream:
-    """Messages of one topic while they are read: times [ns since 1970] and flat fields.
-
-    `stamped` is 0 for a message without a stamp; `failed` counts those that could not be decoded, with the
-    `reason` of the first.
-    """
+    """Messages of one topic while they are read: times [ns since 1970] and flat fields. `stamped` is 0 for a
+    message without a stamp; `failed` counts those that could not be decoded, with the `reason` of the
+    first."""
 
     topic: str
     logged: list[int] = field(default_factory=list)
@@ -333,11 +331,9 @@ def join_streams(
 
 
 def _clock_of(file: str, used: Sequence[Stream]) -> tuple[bool, list[str]]:
-    """Whether the headers' stamps are of one clock, and a note if they are of several.
-
-    Messages of one recorder are logged by one clock, soon after they are stamped. Their stamps lag by much
-    the same, even if they count from another zero (simulated time).
-    """
+    """Whether the headers' stamps are of one clock, and a note if they are of several. Messages of one
+    recorder are logged by one clock, soon after they are stamped. Their stamps lag by much the same, even if
+    they count from another zero (simulated time)."""
     if not all(all(stream.stamped) for stream in used):
         return False, []
     late = {s.topic: np.quantile(np.array(s.logged) - np.array(s.stamped), [0.05, 0.5, 0.95]) for s in used}
@@ -354,10 +350,8 @@ def _clock_of(file: str, used: Sequence[Stream]) -> tuple[bool, list[str]]:
 
 
 def interpolated(ticks: np.ndarray, times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values at the ticks (num_ticks,), NaN in gaps, and which of them lie between two messages.
-
-    `ticks` and `times` are in ns (or s), increasing; NaN among `values` (num_messages,) are skipped.
-    """
+    """Values at the ticks (num_ticks,), NaN in gaps, and which of them lie between two messages. `ticks` and
+    `times` are in ns (or s), increasing; NaN among `values` (num_messages,) are skipped."""
     there = np.isfinite(values)
     times, values = times[there], values[there]
     if not times.size:

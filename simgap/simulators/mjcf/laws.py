@@ -43,8 +43,7 @@ class Laws:
 
     `friction`: of joints; `fading`: by drive the actuator, the fade over its largest force, the joint's
     number, and its torque by a unit force; `uneven`: by joint the numbers of coordinate and velocity, the
-    periods per turn, both amplitudes, and whether they multiply the motor's torque.
-    """
+    periods per turn, both amplitudes, and whether they multiply the motor's torque."""
 
     friction: tuple[_Friction, ...]
     fading: tuple[tuple[int, float, int, float], ...]

@@ -51,11 +51,8 @@ Place = Annotated[Name | tuple[Finite, Finite, Finite], WrapValidator(_placed)]
 
 
 class Mapped(Quantity):
-    """One column: the joint, actuator, sensor, body or site of the model that it records.
-
-    `kind` is the quantity, `axis` its component; SI = sign * unit * column + offset; `noise` is in the
-    column's unit.
-    """
+    """One column: the joint, actuator, sensor, body or site of the model that it records. `kind` is the
+    quantity, `axis` its component; SI = sign * unit * column + offset; `noise` is in the column's unit."""
 
     joint: Name | None = None
     actuator: Name | None = None
@@ -122,8 +119,7 @@ class Map(StrictTable):
     `columns`: by name; `clock`: the column of times; `length`: of the windows that are compared [s];
     `keyframe`: where what no column gives starts; `uncertain`: patterns of what was never measured; `sd`:
     standard deviations of what was, by name; `payload_at`: by body the site where it carries a load, or the
-    place [m] in the body's frame.
-    """
+    place [m] in the body's frame."""
 
     model_config = ConfigDict(populate_by_name=False)
 

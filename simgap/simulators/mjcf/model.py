@@ -34,8 +34,7 @@ class MjcfSimulator:
     `sensor`: address in the sensor data by compared column; `joints`: joint by position column; `driven`:
     actuator by command column; `free`: columns of the pose by free joint; `poses`: columns of every body
     whose whole pose is read; `played`: models with play in a joint, by setting; `spec`: what the model was
-    compiled from.
-    """
+    compiled from."""
 
     model: Any
     map: Map
@@ -132,10 +131,8 @@ class MjcfSimulator:
         return np.where(np.isfinite(found), found, first)
 
     def _state(self, job: Job, bare: np.ndarray | None = None, ran: np.ndarray | None = None) -> np.ndarray:
-        """Full physics state (size,) at a window's start.
-
-        `bare`: the state that columns do not determine; `ran`: the states of the log as the model runs it.
-        """
+        """Full physics state (size,) at a window's start. `bare`: the state that columns do not determine;
+        `ran`: the states of the log as the model runs it."""
         there = None if ran is None else ran[job.recording.first]
         if job.start is None or bare is None:
             state = self._own_state(job.recording) if there is None or not self._partial else there.copy()
@@ -246,10 +243,8 @@ class MjcfSimulator:
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
     def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[Pairs]]:
-        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch at each.
-
-        A contact begins and ends between samples, so the samples on either side count too.
-        """
+        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch at each. A contact
+        begins and ends between samples, so the samples on either side count too."""
         t, none = recording.t[self._shown(recording)], frozenset[tuple[int, int]]()
         if not self.touching:
             return t, [none] * t.size

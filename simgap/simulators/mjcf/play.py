@@ -30,11 +30,8 @@ LIGHT = 1e-6  # numerics: kg, kg m^2: the motor's body; its rotor is its joint's
 
 @dataclass
 class Played:
-    """A model in which one joint has play.
-
-    `joint`: its number in the plain model; `logs`: by name; `width`: the setting of the play; `seen`: joint
-    by position column.
-    """
+    """A model in which one joint has play. `joint`: its number in the plain model; `logs`: by name; `width`:
+    the setting of the play; `seen`: joint by position column."""
 
     model: Any
     runs: Runs

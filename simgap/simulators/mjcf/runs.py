@@ -30,10 +30,8 @@ class Held:
         self.at = self._at(since)
 
     def __call__(self, values: np.ndarray, line: float = 0.0) -> np.ndarray:
-        """Means (..., steps) of a column (..., n); missing samples repeat the one before.
-
-        `line`: from 0, held in steps, to 1, on lines to the next sample.
-        """
+        """Means (..., steps) of a column (..., n); missing samples repeat the one before. `line`: from 0,
+        held in steps, to 1, on lines to the next sample."""
         seen = np.isfinite(values)
         if seen.all():
             t, u, k = self.since, values, self.at
@@ -126,8 +124,7 @@ class Runs:
 
     The same windows are run hundreds of times, so how they lie on the steps is kept. So are the latest runs,
     because many are needed again: a finite difference in one number of the solver includes the runs of all
-    others.
-    """
+    others."""
 
     model: Any
     data: Sequence[Any]

@@ -33,8 +33,7 @@ class Setting:
 
     `derived`: whether constants derived from it (mj_setConst) must be recomputed; `stored`: whether MuJoCo
     writes it to XML; `mixed`: of what comes in whole steps only, the value whose run is interpolated with the
-    nominal one.
-    """
+    nominal one."""
 
     name: str
     unit: str
