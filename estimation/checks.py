@@ -133,8 +133,7 @@ def misfits(aligned: AlignedTrials) -> list[str]:
 
 
 def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> list[str]:
-    """Blocks too heavy for their size in any material: forces in a smaller unit than N. `found`: means by
-    (object, property) [N, m]."""
+    """Blocks too heavy for their size in any material, as in a smaller unit than N; `found`: means [N, m]."""
     for obj in task.objects:
         weight, width = (found.get((obj, prop), 0.0) for prop in ("weight", "width"))
         height = found.get((obj, "height"), width)

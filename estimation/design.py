@@ -58,8 +58,8 @@ Terms = dict[str, int]
 
 
 def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[Terms]:
-    """Independent integer combinations of the unknowns in `order` that span `rows`, single ones first. Each
-    is {unknown: coefficient} with coprime coefficients, the first of them positive."""
+    """Independent combinations of the unknowns in `order` that span `rows`, {unknown: coprime coefficient,
+    the first positive}, single ones first."""
     given = [
         _whole({k: Fraction(v) for k, v in row.items() if v}, order) for row in rows if any(row.values())
     ]
@@ -209,14 +209,12 @@ class PadDoubt:
 
     @property
     def extra_sd(self) -> float:
-        """Prior standard deviation of the share beyond what the rig admits. A mixture of 0 if the rig is
-        right, and of the share that the slopes show if it is wrong."""
+        """Prior sd of the share beyond what the rig admits: 0 if it is right, the slopes' share if wrong."""
         return abs(self.share) * float(np.sqrt(self.odds))
 
     @property
     def slope_sd(self) -> float:
-        """Common error of the slopes, and of each slope on its own. A share of the true give, and the common
-        effect of noise in forces or places."""
+        """Common error of slopes, and of each: a share of the true give, and noise in forces or places."""
         return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 

@@ -119,7 +119,7 @@ class SlipEvidence:
 def slip_evidence(
     stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
 ) -> SlipEvidence:
-    """Evidence for slip in one block's grips, whose coefficient is its bound: draws (num_draws,). `others`:
+    """Evidence for slip in one block's grips, whose coefficient is its bound (num_draws,); `others`:
     stretches with other blocks, which show the drift of anchors without slip."""
     stretches = [s for s in stretches if s.t.size > 2]
     if not stretches:
@@ -232,8 +232,8 @@ def largest_ratio(
 
 
 def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples in each bin (num_bins,) after redrawing the location of every atom with its samples. Without
-    this step an atom with many samples would never leave its bin."""
+    """Samples in each bin (num_bins,) after every atom was redrawn with its samples, which it could else not
+    leave."""
     atoms, member = np.unique(bins, return_inverse=True)
     joint = np.zeros((atoms.size, log_likelihood.shape[1]))
     np.add.at(joint, member, log_likelihood)
@@ -314,8 +314,7 @@ def friction_posteriors(
 
 
 def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
-    """Forces of one finger less their mean in free motion, where they should vanish. Variation in free motion
-    beyond the sensors' noise (a cable that pulls) counts as noise."""
+    """Forces of one finger less their mean in free motion, whose variation beyond noise counts as noise."""
     free, stated = a.free > 0, a.signals.sd_force
     stated = stated if np.isfinite(stated) else sd_force
     centred, sds = [], []
@@ -335,9 +334,8 @@ def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
 
 
 def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment. While a
-    pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the ratio of two small
-    forces is uninformative."""
+    """Samples (num_timesteps,) at which the finger presses firmly, `holding` under each alignment: while a
+    pad closes or opens, its damping adds shear that Coulomb's law does not bound."""
     recorded = np.isfinite(forces.normal + forces.shear)
     core = (holding.mean(axis=0) > 0.5) & recorded
     if not core.any():

@@ -170,8 +170,8 @@ def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
 
 
 def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
-    """Which of the subtasks shown (num_subtasks,) have samples that determine properties. A grip without its
-    carry may hold anything."""
+    """Which of the subtasks shown (num_subtasks,) determine properties: a grip without its carry may hold
+    anything."""
     out = present.copy()
     for carry in steps:
         if carry.state == ABOVE_GROUND and not present[carry.index]:
@@ -281,8 +281,8 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
 
 
 def _free_samples(s: Signals, free: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) of `free` motion with all forces, apart from contact changes. Next to a change
-    one finger may touch alone, or the sample already be in contact."""
+    """Samples (num_timesteps,) of `free` motion with all forces, apart from changes, where one finger may
+    touch."""
     free = free & np.isfinite(s.fx1 + s.fy1 + s.fx2 + s.fy2)
     margin = 1 + int(np.ceil(APART / float(np.median(np.diff(s.t)))))
     return free & (np.convolve(~free, np.ones(2 * margin + 1), "same") == 0)

@@ -36,8 +36,8 @@ SLOPE_SD = 0.1
 
 @dataclass(frozen=True, repr=False)
 class Slope(Brief):
-    """A slope over the give as a weighted sum of readings: weights (num_timesteps,), and its variance.
-    `alike`: error common to all slopes of a hand (part of `variance`)."""
+    """A slope over the give as a weighted sum of readings (num_timesteps,); `alike`: the part of its
+    variance's root that all slopes of a hand share."""
 
     weights: np.ndarray
     variance: float

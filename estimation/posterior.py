@@ -120,7 +120,7 @@ BATCH = 256  # numerics: densities at once, to keep memory small
 @dataclass(frozen=True)
 class Posterior:
     """Posterior of a design; scales theta are log s_c (3) and log(k_c / its prior median) (3). `reference`
-    (Q,): least-squares solution, subtracted from the unknowns to keep precision."""
+    (Q,): least-squares solution, subtracted for precision."""
 
     design: Design
     reference: np.ndarray
@@ -154,8 +154,8 @@ class Posterior:
         return np.concatenate(parts)
 
     def given(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (W, Q + N + 6) and Cholesky factor of the precision of (q, z, e, f) given scales (W, 6). q
-        relative to `reference`."""
+        """Mean (W, Q + N + 6), q relative to `reference`, and Cholesky factor of the precision given
+        scales."""
         precision, gradient, _ = normal_equations(theta, self.model)
         return np.linalg.solve(precision, gradient[..., None])[..., 0], np.linalg.cholesky(precision)
 
@@ -206,8 +206,8 @@ STARTS = np.arange(-1.0, 9.0, 1.0)  # numerics: log(share / prior median); a lar
 
 @dataclass(frozen=True)
 class Mode:
-    """Mode (6,) of the scales and their covariance (6, 6); unknowns (Q,) there and theirs (Q, Q). The
-    covariance of the unknowns is conditional on the scales' mode."""
+    """Mode (6,) of the scales, their covariance (6, 6), unknowns (Q,) there and their conditional one (Q,
+    Q)."""
 
     scales: np.ndarray
     covariance: np.ndarray
@@ -238,8 +238,8 @@ def find_mode(post: Posterior) -> Mode:
 
 @lru_cache
 def _climb() -> Callable[[np.ndarray, Model], Any]:
-    """Map a start (6,) to the nearest maximum (6,) of the density; one compiled program per padded size. On
-    the CPU in any case: six scales are not worth a transfer to an accelerator."""
+    """Map a start (6,) to the nearest maximum (6,) of the density, on the CPU: one program per padded
+    size."""
     import jax  # these are slow to import
     import jax.numpy as jnp
     import optimistix

@@ -214,7 +214,7 @@ def _resampled(weight: np.ndarray, random: np.random.RandomState) -> np.ndarray:
 
 
 def effective_sample_size(chain: np.ndarray) -> float:
-    """Smallest effective sample size over parameters of a chain (walkers, steps, dim). By emcee's
+    """Smallest effective sample size over parameters of a chain (walkers, steps, dim), by emcee's
     autocorrelation time (Goodman & Weare 2010); 0 if a parameter never moved."""
     import emcee  # slow to import: it loads scipy.stats
 
@@ -225,10 +225,8 @@ def effective_sample_size(chain: np.ndarray) -> float:
 
 
 def split_rhat(chain: np.ndarray) -> float:
-    """Largest split R-hat over parameters of a chain (walkers, steps, dim).
-
-    Walkers are joined into GROUPS chains (one walker alone is too short to have a variance of its own), each
-    halved in time: Gelman et al. 2013, Bayesian Data Analysis, section 11.4. Walkers of an ensemble are not
+    """Largest split R-hat over parameters of a chain (walkers, steps, dim) whose walkers are joined into
+    GROUPS chains, halved in time: Gelman et al. 2013, section 11.4. Walkers of an ensemble are not
     independent, so this only detects drift and stuck groups."""
     walkers, steps, dim = chain.shape
     half, per_group = steps // 2, walkers // GROUPS

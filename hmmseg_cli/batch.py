@@ -78,11 +78,9 @@ def segment_apart(
     paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
     advance: Callable[[int], None], tell: Callable[[str], None],
 ) -> Iterator[Segmented]:  # fmt: skip
-    """Results of `segment_one`, in the order of the paths; `advance` gets the number of further ones done.
-
-    A recording whose worker is lost is segmented again by itself; if that worker is lost too, it is left out
-    with a warning to `tell`. InputError if a recording or the cluster is at fault; the rest is then
-    cancelled."""
+    """Results of `segment_one`, in the order of the paths; `advance` gets the number of further ones done. A
+    recording whose worker is lost is segmented once more by itself, then left out with a warning to `tell`.
+    InputError if a recording or the cluster is at fault."""
     left, lab = list(paths), (task.absolute(), rig.absolute())
     while left:
         with _executor(workers, scheduler) as executor:

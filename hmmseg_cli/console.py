@@ -71,9 +71,9 @@ def _write_groups(formatter: Any, rows: Iterable[tuple[str, tuple[str, str] | No
 
 
 class Output:
-    """Destinations of one command's results: the screen, a JSON document, figures and a report. A context
-    manager. `print` and `warn` show text, `figure` and `stage` return paths to draw and write to, and
-    `finish` puts everything in place. Raises InputError at once if a destination cannot be written."""
+    """Destinations of one command's results: screen, JSON document, figures and report. `figure` and `stage`
+    return paths to write to, and `finish` puts everything in place. InputError at once if one cannot be
+    written."""
 
     def __init__(self, command: str, *, json: str | None = None, figures: Path | None = None,
                  report: Path | None = None, seed: int = 0, quiet: bool = False) -> None:  # fmt: skip
@@ -114,8 +114,8 @@ class Output:
         self._cleanup.close()
 
     def print(self, *renderables: Any, whole: bool = False) -> None:
-        """Show tables or text on standard output, or on standard error if `--json -` takes that. `whole`:
-        lines are not wrapped, so that they can be copied."""
+        """Show tables or text, on standard error if `--json -` takes standard output; `whole`: without
+        wrapping."""
         for renderable in renderables:
             with self._console.unless_lost():
                 self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
@@ -140,8 +140,7 @@ class Output:
 
     @contextlib.contextmanager
     def progress(self, text: str, total: int) -> Iterator[Callable[..., None]]:
-        """A progress bar on standard error; yields a function that advances it by some steps and may set its
-        text."""
+        """A progress bar on standard error; yields a function that advances it and may set its text."""
         from rich.progress import Progress
 
         with Progress(console=self._side, transient=True, disable=not self._side.is_terminal) as bar:
@@ -204,9 +203,8 @@ def _plain(value: Any) -> Any:
 
 
 def distinct_trials(paths: Sequence[Path]) -> list[Path]:
-    """The trials' paths, `FILE#NAME` for each recording of a file with several. InputError if a trial is
-    given twice, even under two names: pooling it with itself would count its noise as independent
-    evidence."""
+    """The trials' paths, `FILE#NAME` for each recording of a file with several; InputError if one is given
+    twice, as its noise would count as independent evidence."""
     seen: dict[str, Path] = {}
     out: list[Path] = []
     for given in paths:
@@ -297,8 +295,8 @@ def named(where: str) -> Iterator[None]:
 
 
 def check_folder(option: str, folder: Path, shown: Path | None = None) -> None:
-    """InputError, about the folder or what is `shown`, unless files can be written into the folder, which
-    need not exist yet."""
+    """InputError, about the folder or what is `shown`, unless files can be written there; it need not
+    exist."""
     existing, where = folder.absolute(), f"{option} {shown or folder}"
     with named(where):
         while not existing.exists():

@@ -102,8 +102,7 @@ AGAIN = 0.02  # numerics: s until an interrupt is repeated; the callback has usu
 
 @contextlib.contextmanager
 def repeat_interrupts() -> Iterator[None]:
-    """Lose no interrupt, and report none with a traceback. A Ctrl-C that arrives while a compiler calls back
-    into Python is dropped there, and repeated here."""
+    """Lose no interrupt: one that arrives while a compiler calls back into Python is repeated here."""
     usual, waiting = sys.unraisablehook, []
 
     def hook(unraisable: Any) -> None:

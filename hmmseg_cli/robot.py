@@ -118,8 +118,7 @@ def fitted_effects(
 
 @contextmanager
 def show_stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages, with the position within long ones; yields the callback of each stage. InputError
-    if the simulation diverges so far from the logs that no equation can be solved."""
+    """Progress by stages; yields their callback. InputError if the simulation diverges far from the logs."""
     from numpy.linalg import LinAlgError
 
     from simgap.progress import heard

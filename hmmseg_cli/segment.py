@@ -83,8 +83,8 @@ def _segment_blocks(
     out: Output, paths: Sequence[Path], task: BlockTask, rig_file: Path,
     thresholds: tuple[float, float] | None, lean: bool,
 ) -> tuple[list[Trial], list[Segmentation]]:  # fmt: skip
-    """Recordings and their segmentations, by the paper's `thresholds` if given, else by the HMM. Long
-    recordings of a repeated task are read from disk if nothing else needs them (`lean`)."""
+    """Recordings and their segmentations, by the paper's `thresholds` or the HMM; long ones from disk if
+    `lean`."""
     from hmmseg.hand.read import is_long
     from hmmseg.hand.signals import task_space
     from hmmseg.segmentation.align import segment

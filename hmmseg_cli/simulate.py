@@ -69,8 +69,7 @@ def simulate(
 def _perform(
     out: Output, task: BlockTask, rig: Rig, blocks: Blocks, count: int, operator: Path | None
 ) -> tuple[dict[str, str], dict[str, Any], Films]:
-    """Trials by the model's own operator: files by name, their part of the document, and scenes to
-    animate."""
+    """Trials by the model's operator: files by name, their part of the document, and scenes to animate."""
     import numpy as np
 
     from simgap.patch import performed
@@ -99,8 +98,7 @@ def _perform(
 def _replay(
     out: Output, path: Path, task: BlockTask, rig: Rig, blocks: Blocks
 ) -> tuple[dict[str, str], dict[str, Any], Films]:
-    """A recording's motions through the model: files by name, their part of the document, scenes to
-    animate."""
+    """A recording's motions through the model: files, their part of the document, scenes to animate."""
     import numpy as np
 
     from hmmseg.contact.decompose import subtasks

@@ -74,8 +74,7 @@ def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
 
 
 def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
-    """The ordered subtasks of a task. In every move of blocks the hand closes on the object, breaks its
-    support contact or slides it, restores contact at the destination, and opens."""
+    """The ordered subtasks of a task: per move of blocks pregrasp, pickup, carry or slide, place, release."""
     if isinstance(task, SequenceTask):
         return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
     support = dict(task.initial)
@@ -271,9 +270,8 @@ class Decomposition(Tabled):
         return sorted(pairs, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
 
     def in_paper(self, index: int, entry: Property) -> bool:
-        """Whether the paper's Table 1 would list the property for this subtask. It reads weight and width
-        only while an object is held above the ground, and mentions friction with a support only in sliding
-        contact (its Sections 2.1 and 3.2)."""
+        """Whether the paper's Table 1 would list the property for this subtask: weight and width only while
+        held above the ground, friction with a support only in sliding contact (Sections 2.1 and 3.2)."""
         state = self.subtasks[index].state
         if entry.name in (WEIGHT, WIDTH):
             return state == ABOVE_GROUND
@@ -387,17 +385,9 @@ VARYING_LOAD = "the vertical force must vary while the object slides"
 
 
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
-    """For each performed move, the rise of its object's bottom as a sum of object heights.
-
-    The paper's height of the block beneath (its Table 3) is the case of a single coefficient.
-
-    Args:
-        task: of blocks.
-
-    Returns:
-        (0-based index of the move, {object: coefficient}) per move: bottom height at place less that
-        at pickup. The rise of a slide is {}.
-    """
+    """For each performed move its 0-based index and the rise of its object's bottom as a sum of object
+    heights, {object: coefficient}; {} for a slide. The paper's height of a block beneath (Table 3) has one
+    coefficient."""
     held, equations = [step for step in subtasks(task) if step.state != FREE], []
     for move, (start, end) in enumerate(zip(held[::3], held[2::3], strict=True)):
         rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}

@@ -102,8 +102,7 @@ def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def numbers(table: Table, name: str) -> np.ndarray:
-    """A column as float64 (num_rows,), NaN where its cell is empty; InputError for a row that is no
-    number."""
+    """A column as float64 (num_rows,), NaN where its cell is empty; InputError for what is no number."""
     column = table.columns[name]
     where = f"{table.file}: column {name}"
     if column.dtype.kind in "fiu":
@@ -139,8 +138,8 @@ def holds_text(values: np.ndarray) -> bool:
 
 
 def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
-    """A column of times (num_rows,) [s], and where its zero lies in ns since 1970 if it holds dates. ISO 8601
-    stamps and dates become s since the first; numbers stay as they are."""
+    """A column of times (num_rows,) [s], of dates since the first, whose ns since 1970 are returned as
+    well."""
     column = table.columns[name]
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.float64) * 1e-9, None

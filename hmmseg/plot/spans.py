@@ -21,8 +21,7 @@ LABEL_SLANT = 40  # look: degrees
 def stacked_panels(
     figure: Figure, t: np.ndarray, panels: Mapping[str, np.ndarray], segmentation: Segmentation
 ) -> list[Axes]:
-    """Draw signals (num_timesteps,) by label at times t [s] in stacked panels, with the subtasks behind
-    them."""
+    """Draw signals (num_timesteps,) by label at times t [s] in stacked panels, over the subtasks."""
     axes = list(np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)))
     for ax, (label, values) in zip(axes, panels.items(), strict=True):
         # Single samples between missing ones would be invisible in a line.
@@ -70,8 +69,7 @@ def name_spans(ax: Axes, segmentation: Segmentation) -> None:
 
 
 def draw_signals(signals: Signals, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
-    """Plot mean position, finger distance, grip, net and shear forces over coloured subtasks. After the
-    paper's Figures 5 to 7."""
+    """Plot position, distance, grip, net and shear forces over subtasks, after the paper's Figures 5 to 7."""
     panels = {
         "Mean $x$\n[cm]": 100 * signals.x,
         "Mean $y$\n[cm]": 100 * signals.y,

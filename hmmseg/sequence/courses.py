@@ -32,9 +32,9 @@ MAX_BLOCKS = 250  # numerics: the cost table is quadratic in this
 def partition(
     values: np.ndarray, num_stretches: int, floor: float, cuts: Sequence[int] | np.ndarray = ()
 ) -> np.ndarray:
-    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 with the least total cost. A stretch of n
-    blocks costs n/2 log(variance + floor^2) per column of `values` (num_cells, num_features), which must be
-    finite; no stretch crosses the cells `cuts`. ValueError for fewer cells than stretches."""
+    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 with the least total cost, n/2 log(variance
+    + floor^2) of a stretch of n blocks per column of the finite `values` (num_cells, num_features); none
+    crosses the cells `cuts`. ValueError for fewer cells than stretches."""
     num_cells = len(values)
     if num_cells < num_stretches:
         raise ValueError(f"{num_cells} cells, expected at least {num_stretches}")
@@ -105,9 +105,8 @@ class Course:
 
 
 def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
-    """Distinct courses of trials `values` [(num_cells, num_features), ...] on a coarse grid. `labels`
-    [(num_states - 1,), ...]: known boundaries as shares of each trial, NaN where unknown. Labelled trials are
-    tried first as starts, with stretches that end at the labels."""
+    """Distinct courses of trials `values` [(num_cells, num_features), ...] on a coarse grid. `labels` as in
+    `naming`; labelled trials are tried first as starts, with stretches that end at the labels."""
     most = max(num_states, min(map(len, values)) // 2)
     numbers = dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES)
     labelled = [i for i, known in enumerate(labels) if np.isfinite(known).any()]
@@ -147,9 +146,9 @@ def _learn_course(
 
 
 def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, share: float) -> np.ndarray:
-    """Log probability (number - 1,) that each change is real, against one state on both sides of it. By
-    `share` independent observations per cell: each side has its own mean and variance per channel (Schwarz
-    criterion), and the change is equally likely between any two cells of a trial."""
+    """Log probability (number - 1,) that each change is real, against one state on both sides: by `share`
+    independent observations per cell, each side with its own mean and variance per channel (Schwarz
+    criterion)."""
     bridged = [np.arcsinh(fill_gaps(v)) for v in values]
     stacked, path = np.vstack(bridged), np.concatenate(paths)
     features = stacked.shape[1]
@@ -221,13 +220,9 @@ WEIGHING = Weighing(
 
 @dataclass(frozen=True)
 class Naming:
-    """Which changes of one course are the named boundaries.
-
-    Attributes:
-        log_evidence: of the course [nats], averaged over all choices.
-        probability: (num_boundaries, num_changes) that boundary b is change j.
-        settled: (num_changes,) that a settled state begins at change j.
-    """
+    """Which changes of one course are the named boundaries: `log_evidence` [nats], averaged over all choices;
+    `probability` (num_boundaries, num_changes) that boundary b is change j; `settled` (num_changes,) that a
+    settled state begins at change j."""
 
     log_evidence: float
     probability: np.ndarray
@@ -236,14 +231,9 @@ class Naming:
 
 @dataclass(frozen=True)
 class Choice:
-    """Changes of one course chosen as the boundaries of its task.
-
-    Attributes:
-        course: its index.
-        ends: changes, numbered from 1, that end the named states, the last one only if `settled`.
-        settled: whether a settled state follows the last named one.
-        right: (num_boundaries,) probability that each boundary is within NEAR of the chosen change.
-    """
+    """Changes of a `course` (its index) chosen as its task's boundaries: `ends`, numbered from 1, of the
+    named states, of the last one only if it is `settled` after it; `right` (num_boundaries,): probability
+    that each boundary is within NEAR of the chosen change."""
 
     course: int
     ends: tuple[int, ...]

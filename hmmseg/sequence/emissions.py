@@ -267,8 +267,8 @@ def weigh(values: np.ndarray, emissions: StudentEmissions, law: Chain,
 
 
 def durations(probability: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean durations [cells] and presence (num_states,), from posterior state probabilities. Presence has a
-    Beta(1, 1) prior."""
+    """Mean durations [cells] and presence (num_states,), with a Beta(1, 1) prior, from posterior
+    probabilities."""
     visited = np.array([p.max(0) for p in probability])
     cells = np.sum([p.sum(0) for p in probability], 0) / np.maximum(visited.sum(0), 0.5)
     return np.maximum(cells, LEAST_CELLS), (visited.sum(0) + 1) / (len(probability) + 2)

@@ -51,8 +51,8 @@ class SequenceFeatures:
 
 
 def drop_repeats(values: np.ndarray) -> np.ndarray:
-    """A channel (num_timesteps,) without repeated readings (NaN) if it is sampled at a lower rate than rows.
-    That is so where no two consecutive samples both change: each repeats the last reading."""
+    """A channel (num_timesteps,) without repeated readings (NaN) if no two consecutive samples both
+    change."""
     changes = np.flatnonzero(np.diff(values) != 0) + 1
     if changes.size < FEWEST or (period := int(np.diff(changes).min())) < 2:
         return values
@@ -62,8 +62,8 @@ def drop_repeats(values: np.ndarray) -> np.ndarray:
 
 
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (num_cells + 1,) and mean of each channel (num_cells, num_channels), NaN in empty cells.
-    InputError where the trial lacks a channel."""
+    """Edges (num_cells + 1,) and means (num_cells, num_channels), NaN in empty cells; InputError if one
+    lacks."""
     for name in channels:
         if name not in trial.channels:
             raise InputError(trial.file, f"has no channel {name}", f"channels {', '.join(channels)}")

@@ -104,14 +104,9 @@ class SequenceModel(Tabled):
         return align([ll], [chain])[0]
 
     def misfit(self, trial: SequenceFeatures) -> tuple[np.ndarray, np.ndarray, AlignmentPosterior]:
-        """How badly a trial fits, without boundary templates, which free switching has no counterpart of.
-
-        Evidence of models learned without labels is coarsened (`hmmseg.sequence.courses`).
-
-        Returns:
-            (2,) log evidence of free switching over forced order [nats], and minus log evidence per cell;
-            the log-likelihoods (num_cells, num_states); the alignment.
-        """
+        """How badly a trial fits, without boundary templates: log evidence of free switching over forced
+        order [nats] and minus log evidence per cell (2,); log-likelihoods (num_cells, num_states); the
+        alignment. Evidence of models learned without labels is coarsened."""
         model, temper = replace(self, detectors=None), self.emissions.temper
         if self.detectors is None:
             temper *= INDEPENDENT / (INDEPENDENT + temper * trial.values.size)
@@ -129,8 +124,8 @@ class SequenceModel(Tabled):
         return log_likelihoods, np.full(num_states, -np.log(num_states)), transition
 
     def failure(self, trial: SequenceFeatures) -> Failure | None:
-        """The first subtask at which a trial leaves the task; None where it fits. The first subtask may be
-        cropped to any length and is not tested for being squeezed."""
+        """The first subtask at which a trial leaves the task; None where it fits. The first may be
+        cropped."""
         names, optional = self.task.sequence, optional_states(self.task, settled=False)
         scores, ll, alignment = self.misfit(trial)
         cells = alignment.smoothed.sum(axis=0)
@@ -156,8 +151,8 @@ def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
 
 
 def usual_misfit(scores: Sequence[np.ndarray]) -> np.ndarray:
-    """Median and width (2, 2) of each score [(2,), ...] over the training trials. The width is widened by 1 +
-    FEW / their number, as that of few trials is uncertain itself."""
+    """Median and width (2, 2) of each score [(2,), ...] over the training trials, widened for their
+    number."""
     center = np.median(scores, axis=0)
     width = NORMAL * np.median(np.abs(np.array(scores) - center), axis=0)
     return np.column_stack([center, np.maximum(width, LEAST_WIDTH) * (1 + FEW / len(scores))])
@@ -200,18 +195,7 @@ def save_model(model: SequenceModel, path: str | Path) -> None:
 
 
 def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
-    """Read a model.
-
-    Args:
-        path: a file written by `save_model`.
-        task: the task for which it was learned.
-
-    Returns:
-        The model.
-
-    Raises:
-        InputError: the file is no model, or was learned for another task.
-    """
+    """Read what `save_model` wrote; InputError if it is no model, or was learned for another task."""
     where, expected = str(path), "a model written by `hmmseg fit`"
     try:
         table = unpack(Path(path))

@@ -63,9 +63,9 @@ def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse],
 
 
 def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
-    """Places [s] of one boundary, most probable first; none where one of them is SURE. `edges` (num_cells +
-    1,) [s]; `crossing` (num_cells - 1,): the boundary's probability at the inner ones; `answer` [s]: the
-    reported time, the first place. A place extends NEAR of the trial to either side."""
+    """Places [s] of one boundary, most probable first; none where one is SURE. `crossing` (num_cells - 1,):
+    its probability at the inner `edges` (num_cells + 1,) [s]; `answer`: the reported time, the first
+    place."""
     inner, left = edges[1:-1], crossing / crossing.sum()
     reach = NEAR * (edges[-1] - edges[0])
     low = np.searchsorted(inner, inner - reach)
@@ -95,21 +95,10 @@ _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interva
 
 def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
                      model: SequenceModel | None = None) -> list[Segmentation]:  # fmt: skip
-    """Segment recordings of a plain ordered task.
-
-    Args:
-        trials: recordings.
-        task: the order of the subtasks.
-        model: from `fit_sequence`; by default learned from these trials themselves.
-
-    Returns:
-        One segmentation a trial. A trial that does not follow the task says so in `failed` and keeps its
-        spans. A skipped optional subtask has no span. Where trials can be read in several ways, spans have
-        `alternatives` and the segmentation a `question`.
-
-    Raises:
-        InputError: trials, task and model do not go together.
-    """
+    """Segment recordings of a plain ordered task, by the model of `fit_sequence` or one learned from these
+    trials. A skipped optional subtask has no span; where trials can be read in several ways, spans have
+    `alternatives` and a segmentation a `question`. InputError where trials, task and model do not go
+    together."""
     if model is None:
         model = fit_sequence(trials, task)
     elif model.task.sequence != task.sequence:

@@ -89,8 +89,7 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
 
 
 def draw_how_far(body: Body, path: Path) -> None:
-    """Mean squared residual of held-out trials before and after correction, and that of healthy
-    recordings."""
+    """Mean squared residual of held-out trials before and after correction, and what healthy ones leave."""
     s = body["shrinkage"]
     with canvas(path, height=1.7) as figure:
         axes = figure.add_subplot()
@@ -160,8 +159,7 @@ def _draw_trial(found: Diagnosis, path: Path) -> None:
 
 
 def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:
-    """Draw the slow course with the largest excess in a subtask: real, simulated, with the effects
-    applied."""
+    """Draw the slow course with the largest excess in a subtask: real, simulated, corrected."""
     lay = found.scene.layout
     excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
     t = (found.scene.bins[1:] + found.scene.bins[:-1]) / 2
@@ -237,8 +235,7 @@ def draw_course(one: Course, found: Robot, path: Path) -> None:
 
 
 def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
-    """Root mean square residual by log before and after correction, cross-validated between logs if it
-    was."""
+    """Root mean square residual by log before and after correction, held out if it was cross-validated."""
     rows, both = found.composed.rows, residuals(found)
     logs = [r.name for r in found.composed.recordings]
     size = np.sqrt(rows.variance)

@@ -52,18 +52,9 @@ class UserSimulator:
 
 
 def load_simulator(spec: str) -> UserSimulator:
-    """Load a simulator from a user's Python file.
-
-    Args:
-        spec: `FILE.py:NAME`; the name is of an object, a class (made without arguments) or a function with
-            attributes `parameters` and `channels`.
-
-    Returns:
-        The simulator, with all calls checked.
-
-    Raises:
-        InputError: The file or the name is missing, its code fails, or what it declares cannot be used.
-    """
+    """Load the simulator `FILE.py:NAME`, an object, a class (made without arguments) or a function with
+    attributes, with all calls checked; InputError if it is missing, fails, or declares what cannot be
+    used."""
     file, _, name = spec.rpartition(":")
     where = f"--simulator {spec}"
     if not file or not name.isidentifier():
@@ -93,9 +84,8 @@ class _Late(BaseException):
 
 @contextmanager
 def calling(where: str, file: str, expected: str = "", patience: float = PATIENCE) -> Iterator[None]:
-    """Run a user's code: whatever it raises becomes an InputError with the line of its `file`. So does a call
-    of more than `patience` [s], where it runs Python in the main thread of a POSIX system. An interrupt stays
-    one."""
+    """Run a user's code: whatever it raises becomes an InputError with the line of its `file`, except for an
+    interrupt. So does more than `patience` [s] in the main thread of a POSIX system."""
     timed = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
 
     def late(*_: Any) -> None:

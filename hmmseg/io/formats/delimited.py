@@ -168,8 +168,7 @@ def rows_in(path: Path, layout: Layout) -> Iterator[tuple[int, list[str]]]:
 
 
 def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] | None:
-    """The header, if a comment holds it (as `numpy.savetxt` writes it) and `line` is the first row of
-    numbers. Comment signs before its first name are not part of the name."""
+    """The header, if a comment holds it, as of `numpy.savetxt`, and `line` is the first row of numbers."""
     cells = cells_of(line, separator)
     if not _numeric(cells):
         return None

@@ -47,9 +47,8 @@ Message = tuple[str, int, Callable[[], Any]]  # topic, when it was logged [ns si
 
 @dataclass
 class Stream:
-    """Messages of one topic while they are read: times [ns since 1970] and flat fields. `stamped` is 0 for a
-    message without a stamp; `failed` counts those that could not be decoded, with the `reason` of the
-    first."""
+    """Messages of one topic while they are read: times [ns since 1970], 0 without a stamp, and flat fields;
+    `failed` counts those that could not be decoded, with the first's `reason`."""
 
     topic: str
     logged: list[int] = field(default_factory=list)
@@ -79,8 +78,8 @@ class Stream:
         return list(dict.fromkeys(name for each in self.values for name in each))
 
     def columns(self, by_header: bool) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Columns named by the same messages: distinct increasing times (num_messages,) [ns], and values
-        (num_messages,) by name."""
+        """Columns named by the same messages: distinct increasing times (num_messages,) [ns], values by
+        name."""
         times = np.array(self.stamped if by_header else self.logged, dtype=np.int64)
         where: dict[str, list[int]] = {}
         for i, each in enumerate(self.values):

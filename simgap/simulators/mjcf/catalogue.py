@@ -134,8 +134,7 @@ class _Catalogue:
                 self.add(wave.name, 0.5 * near, says, often - near, often + near, effect, wave)
 
     def add_ties(self) -> None:
-        """How softly joints follow those that equalities tie them to: MuJoCo's default is softer than any
-        linkage."""
+        """How softly joints follow those they are tied to: by default softer than any linkage."""
         m = self.model
         for k in tied(m):
             name, soft = name_of(m, "joint", int(m.eq_obj1id[k])), float(m.eq_solref[k, 0])

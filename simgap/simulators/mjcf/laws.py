@@ -83,17 +83,8 @@ class Laws:
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Run a model with laws.
-
-    Args:
-        model, data: MuJoCo's.
-        laws: What acts.
-        first: Full states (B, size) to run from.
-        control: Controls (B, steps, actuators).
-
-    Returns:
-        Sensors (B, steps, sensors), as of `mujoco.rollout`.
-    """
+    """Sensors (B, steps, sensors), as of `mujoco.rollout`, of a model with laws from full states `first` (B,
+    size) under controls (B, steps, actuators)."""
     out = np.empty((*control.shape[:2], model.nsensordata))
     plain, nu, step = np.array(model.dof_frictionloss), model.nu, mujoco.mj_step
     # Plain numbers and views of memory, several times as fast as elements and rows of arrays.

@@ -34,8 +34,8 @@ from simgap.simulators.recording import Recording, held, read_recording
 
 @dataclass(frozen=True)
 class Loaded:
-    """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs; `digest`: a
-    hash of model and map."""
+    """A model to compare logs with, without parameters until `effects` has seen logs; `digest`: a hash of
+    it."""
 
     simulator: MjcfSimulator
     map: Map
@@ -70,25 +70,13 @@ class Loaded:
         return replace(log, warnings=tuple(warnings))
 
     def effects(self, recordings: Sequence[Recording]) -> list[RobotEffect]:
-        """Candidates that need the logs. Those that the model can be set to become parameters of the
-        simulator; the others are returned."""
+        """Candidates that need the logs: the simulator gets new parameters, and the others are returned."""
         return offered(self.simulator, recordings, self.candidates)
 
 
 def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Loaded:
-    """Read and check a model and its map.
-
-    Args:
-        xml: The MJCF or URDF file.
-        map_file: Its map (TOML).
-        candidates: Names of further settings to offer as causes.
-
-    Returns:
-        The simulator, and how logs are read for it.
-
-    Raises:
-        InputError: MuJoCo does not read the model, or the map or a candidate names what the model lacks.
-    """
+    """Read and check a model and its map, with names of further settings to offer as causes; InputError if
+    MuJoCo does not read it, or a name is not in the model."""
     if not xml.is_file():
         raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
     if xml.suffix.lower() == ".mjb":
@@ -144,8 +132,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
 
 
 def _add_motors(spec: Any, columns: Mapping[str, Mapped], file: str) -> None:
-    """Add to a model without actuators, such as a URDF, a motor for every joint whose torque a column
-    commands, under the joint's name."""
+    """Add to a model without actuators, such as a URDF, motors for the joints whose torque is commanded."""
     for column, m in columns.items():
         if m.thing == "sensor" or m.kind not in ("command", "force", "torque"):
             continue
@@ -298,8 +285,7 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
 
 
 def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
-    """InputError where a servo's goals are its joint's angles or rates in other units; units are never
-    guessed."""
+    """InputError where a servo's goals are its joint's in other units; units are never guessed."""
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
         joint, per = int(model.actuator_trnid[a, 0]), "/s" if follows_rates(model, a) else ""

@@ -61,8 +61,8 @@ class Played:
             return self.runs([j.recording for j in jobs], own, tuple(changed))
 
     def _ahead(self, log: Recording, width: float) -> np.ndarray:
-        """By how much the motor is ahead of its joint, and faster, at a log's samples (n, 2), in the model as
-        it came."""
+        """How far the motor is ahead of its joint, and faster, at a log's samples (n, 2), as the model
+        came."""
         return latest(self.known, (log.name, width), lambda: self._run(log, width), KEPT)
 
     def _run(self, log: Recording, width: float) -> np.ndarray:
@@ -85,19 +85,8 @@ def played(
     spec: Any, name: str, actuator: str, make: Callable[[Any], Runs], wanted: Sequence[str],
     logs: Mapping[str, Recording], seen: Mapping[str, int],
 ) -> Played | None:  # fmt: skip
-    """Build the model with play in a joint.
-
-    Args:
-        spec: The MjSpec, which is changed.
-        name, actuator: The joint, and the actuator that moves it.
-        make: Makes the runs of a model.
-        wanted: Settings that the model is to have.
-        logs: By name.
-        seen: Joint by position column.
-
-    Returns:
-        The model; None where the joint has no rotor that could move alone, or MuJoCo refuses it.
-    """
+    """Build, by changing `spec`, the model with play in the joint `name` that `actuator` moves; None where it
+    has no rotor that could move alone, or MuJoCo refuses it."""
     joint, body = spec.joint(name), spec.joint(name).parent
     if not joint.armature > 0:
         return None

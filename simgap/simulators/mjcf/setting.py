@@ -64,8 +64,8 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 
 def payload_place(model: Any, name: str) -> np.ndarray:
-    """Where a body carries a load (3,) [m], in its frame: its farthest site, else the farthest centre of its
-    geoms, else its centre of mass."""
+    """Where a body carries a load (3,) [m]: its farthest site, else geom's centre, else its centre of
+    mass."""
     b = object_id(model, "body", name)
     for places, owner in ((model.site_pos, model.site_bodyid), (model.geom_pos, model.geom_bodyid)):
         mine = np.array(places[np.asarray(owner) == b])
@@ -311,18 +311,8 @@ KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...
 
 
 def setting_of(model: Any, name: str) -> Setting:
-    """The setting of a model by its name.
-
-    Args:
-        model: A compiled MuJoCo model.
-        name: `KIND:NAME.ATTRIBUTE`; `option.ATTRIBUTE` and `drive.ATTRIBUTE` of the whole model.
-
-    Returns:
-        The setting, whose nominal value is the model's.
-
-    Raises:
-        InputError: The name is unknown; the nearest known one is named.
-    """
+    """The setting `KIND:NAME.ATTRIBUTE`, or of the whole model `option.ATTRIBUTE` or `drive.ATTRIBUTE`, with
+    the model's value as its nominal one; InputError names the nearest known."""
     where = f"--candidate {name}"
     head, dot, attribute = name.rpartition(".")
     kind, colon, thing = head.partition(":")
