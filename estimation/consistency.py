@@ -73,8 +73,8 @@ FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
 @dataclass(frozen=True)
 class Grip:
-    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move. `beneath`:
-    objects from its support down to the ground."""
+    """Where the fingertips hold a standing block [m] before (`pickup`) or after (`place`) a move, on
+    `beneath`."""
 
     move: int
     key: str
@@ -407,8 +407,8 @@ class ForceScale:
 def force_scale(
     doubts: Mapping[str, PadDoubt], weighed: Sequence[WeighedTrial], rig: Rig
 ) -> ForceScale | None:
-    """Scale of the forces if pads and noise give any evidence against 1, else None. Not applicable to late
-    forces, which flatten the slopes of readings over them."""
+    """Scale of the forces if pads and noise give evidence against 1; late forces flatten the slopes it
+    needs."""
     tip = rig.fingertip
     if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
         return None

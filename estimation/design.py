@@ -58,8 +58,8 @@ Terms = dict[str, int]
 
 
 def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[Terms]:
-    """Independent combinations of the unknowns in `order` that span `rows`, {unknown: coprime coefficient,
-    the first positive}, single ones first."""
+    """Independent integer combinations of the unknowns in `order` that span `rows`, coprime, single ones
+    first."""
     given = [
         _whole({k: Fraction(v) for k, v in row.items() if v}, order) for row in rows if any(row.values())
     ]
@@ -220,8 +220,7 @@ class PadDoubt:
 
 def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads whose compliance is 1 + size of the nominal, so that their faces lie elsewhere under a force.
-        With `usual`: pads that give as force^(1 + size), as the nominal at that force; to first order."""
+        """Pads of 1 + size times the nominal compliance; with `usual`, which give as force^(1 + size)."""
         signals, moved = task_space(trial, rig), {}
         for finger in fingers:
             name = f"{'x' if kind == 'normal' else 'y'}{finger}"
@@ -316,8 +315,8 @@ def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.nda
 def pad_doubts(
     slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
 ) -> dict[str, PadDoubt]:
-    """Evidence of slopes (num_trials, num_moves, len(SLOPES)) against the rig's pads, "normal" and "shear".
-    `variance`, `alike`: as in `slope_variances`, of all trials."""
+    """Evidence of slopes (num_trials, num_moves, len(SLOPES)), as of `slope_variances`, against the rig's
+    pads."""
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
     for s, grip in ((a.signals, grip) for a in weighed for grip in a.grips.values()):
         along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
@@ -556,11 +555,9 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
 def _combined(
     raw: np.ndarray, variance: np.ndarray, valid: np.ndarray, coefficients: np.ndarray, where: tuple
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means, variances (K,) and coefficients (K, Q) of the observations, drawn alignments combined.
-
-    Alignments are imputations, so the variance is that within one alignment plus 1 + 1 / S times that between
-    them (Rubin 1987, Multiple Imputation, equation 3.1.5). Differences that follow from the coefficients of a
-    longer or shorter span do not count as variation between alignments."""
+    """Means, variances (K,) and coefficients (K, Q) of the observations. Drawn alignments are imputations:
+    their variance is that within one plus 1 + 1 / S times that between them (Rubin 1987, equation 3.1.5),
+    without what follows from the coefficients of a longer or shorter span."""
     used = np.moveaxis(valid, 1, -1)[where]  # K, S
     num = used.sum(axis=1)
 

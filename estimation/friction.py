@@ -119,8 +119,8 @@ class SlipEvidence:
 def slip_evidence(
     stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
 ) -> SlipEvidence:
-    """Evidence for slip in one block's grips, whose coefficient is its bound (num_draws,); `others`:
-    stretches with other blocks, which show the drift of anchors without slip."""
+    """Evidence for slip in one block's grips, of this bound (num_draws,); `others` show drift without
+    slip."""
     stretches = [s for s in stretches if s.t.size > 2]
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)
@@ -232,8 +232,7 @@ def largest_ratio(
 
 
 def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples in each bin (num_bins,) after every atom was redrawn with its samples, which it could else not
-    leave."""
+    """Samples in each bin (num_bins,) after every atom was redrawn with its samples, lest it never leave."""
     atoms, member = np.unique(bins, return_inverse=True)
     joint = np.zeros((atoms.size, log_likelihood.shape[1]))
     np.add.at(joint, member, log_likelihood)
@@ -286,9 +285,7 @@ def friction_posteriors(
     weighed: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
     rng: np.random.Generator, weights: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
-    """Friction of every object of the task, all trials pooled, alignments marginalised. `sd_force`: noise of
-    one force sample [N] if the signals do not state it; `weights`: posterior draws of objects' weights
-    [N]."""
+    """Friction of every object, alignments marginalised; `sd_force`: of a sample [N] if unstated."""
     steps = subtasks(task)
     fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in weighed]
     held = {obj: _held(weighed, fingers, steps, obj) for obj in task.objects}

@@ -258,8 +258,7 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
 
 
 def source_subtasks(described: Decomposition, obj: str, prop: str) -> list[str]:
-    """Names of the subtasks, such as `carry block1`, whose samples determine this property
-    unconditionally."""
+    """Names, such as `carry block1`, of the subtasks whose samples determine this property."""
     evidence = [e for e in described.properties[obj][prop].evidence if e.condition is None]
     return list(dict.fromkeys(described.subtasks[k].label for one in evidence for k in one.subtasks))
 

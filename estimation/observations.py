@@ -47,8 +47,8 @@ class Noise:
 
 
 def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str, float]:
-    """Nominal noise of one sample behind each mean [N, m], the median over samples; NaN if unstated. Empty
-    for a sensor in the wrist, whose fingers are virtual."""
+    """Nominal noise of one sample behind each mean [N, m], NaN if unstated; none for a sensor in the
+    wrist."""
     pads, out = pads_of(aligned.rig), dict[str, float]()
     if any(one.trial.inertia is not None for one in aligned.trials):
         return out
@@ -62,8 +62,7 @@ def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str,
 
 
 def estimated_noise(pooled: dict[str, list], scales: dict[str, float], stated: dict[str, float]) -> Noise:
-    """Noise of each channel from residuals and their weights, pooled over grips. `stated`: standard
-    deviations of one sample, where known."""
+    """Noise of each channel from residuals and weights, pooled over grips; `stated`: sds where known."""
     variance, count = {}, {}
     for key, pairs in pooled.items():
         pairs = [(r[np.isfinite(r)], w[np.isfinite(r)]) for r, w in pairs]
@@ -88,12 +87,9 @@ def estimated_noise(pooled: dict[str, list], scales: dict[str, float], stated: d
 
 
 def autocorrelation_time(series: list[np.ndarray]) -> float:
-    """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH.
-
-    Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of lags (0,
-    1), (2, 3), ... up to the first pair that is not positive. Below 1 if successive residuals cancel, as in
-    differentiated noise. Autocorrelations of series about their own mean are biased by -1 / length, which is
-    corrected."""
+    """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH: Geyer's (1992)
+    initial positive sequence, below 1 if successive residuals cancel, as in differentiated noise.
+    Autocorrelations about a series' own mean are biased by -1 / length, which is corrected."""
     power, size = sum(float(r @ r) for r in series), sum(r.size for r in series)
     bias = len(series) / max(size, 1)
 
@@ -170,7 +166,7 @@ def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
 
 
 def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
-    """Which of the subtasks shown (num_subtasks,) determine properties: a grip without its carry may hold
+    """Which subtasks shown (num_subtasks,) determine properties: a grip without its carry may hold
     anything."""
     out = present.copy()
     for carry in steps:
@@ -281,8 +277,7 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
 
 
 def _free_samples(s: Signals, free: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) of `free` motion with all forces, apart from changes, where one finger may
-    touch."""
+    """Samples (num_timesteps,) of `free` motion with all forces, apart from changes of contact."""
     free = free & np.isfinite(s.fx1 + s.fy1 + s.fx2 + s.fy2)
     margin = 1 + int(np.ceil(APART / float(np.median(np.diff(s.t)))))
     return free & (np.convolve(~free, np.ones(2 * margin + 1), "same") == 0)

@@ -36,8 +36,8 @@ SLOPE_SD = 0.1
 
 @dataclass(frozen=True, repr=False)
 class Slope(Brief):
-    """A slope over the give as a weighted sum of readings (num_timesteps,); `alike`: the part of its
-    variance's root that all slopes of a hand share."""
+    """A slope over the give as a weighted sum of readings (num_timesteps,); `alike`: error common to all
+    slopes."""
 
     weights: np.ndarray
     variance: float

@@ -58,8 +58,7 @@ class Model(NamedTuple):
 
 
 def normal_equations(theta: Any, model: Model, xp: ModuleType = np) -> tuple[Any, Any, Any]:
-    """Precision (W, S, S) of b given scales theta (W, 6), precision times mean, and the rest of the density.
-    Precision times mean is (W, S); the log density (W,), up to a constant, is that of the terms without b."""
+    """Precision (W, S, S) of b at theta (W, 6), precision times mean (W, S), log density without b (W,)."""
     share = priors.SCATTER_MEDIAN[None] * xp.exp(theta[:, NUM_CHANNELS:])
     variance = xp.exp(2 * theta[:, :NUM_CHANNELS] @ model.of) * model.variance[None]
     weight = 1 / (variance + (share @ model.of * model.unit[None]) ** 2)
@@ -119,8 +118,7 @@ BATCH = 256  # numerics: densities at once, to keep memory small
 
 @dataclass(frozen=True)
 class Posterior:
-    """Posterior of a design; scales theta are log s_c (3) and log(k_c / its prior median) (3). `reference`
-    (Q,): least-squares solution, subtracted for precision."""
+    """Posterior of a design; theta: log s_c, log(k_c / its prior median); `reference` (Q,): least squares."""
 
     design: Design
     reference: np.ndarray

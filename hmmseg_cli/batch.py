@@ -39,8 +39,7 @@ class Segmented:
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """The paths, with plain folders replaced by the recordings in them, in the order of their names.
-    Recordings in .txt files must be named: in a folder they might be notes."""
+    """The paths, with plain folders replaced by the recordings in them, sorted; .txt files may be notes."""
     out, kinds = list[Path](), [kind for kind in KINDS if kind != ".txt"]
     for path in paths:
         inside = [path]

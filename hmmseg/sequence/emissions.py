@@ -178,8 +178,8 @@ def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence
 
 
 def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
-    """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary added. A path that
-    skips a state crosses both its boundaries."""
+    """The chain with log weights (num_cells - 1, num_boundaries) of crossing, two where a state is
+    skipped."""
     total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
     stay, *jumps = chain.bands
     advance, *skips = (

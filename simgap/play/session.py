@@ -150,9 +150,8 @@ class Session:
         return {"kind": "frame", "t": self.nominal.t, "command": self.command.tolist(), "worlds": worlds}
 
     def save(self, folder: Path) -> list[Path]:
-        """Save the nominal world's recording as the next trial_NN.csv, with rig, task and true properties.
-        ValueError if it is shorter than a second, InputError if the folder belongs to another session.
-        Existing files are never replaced."""
+        """Save the nominal world's recording as the next trial_NN.csv, with rig, task and true properties,
+        replacing nothing. ValueError if shorter than a second, InputError in another session's folder."""
         rows = np.array(self._rows)
         if len(rows) < 1000:
             raise ValueError("less than a second has been recorded")

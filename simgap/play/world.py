@@ -34,8 +34,7 @@ def felt_effects() -> dict[str, HandEffect]:
 
 
 def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Parameters of an effect, as given; by default those of its first form, strong enough to be felt.
-    InputError for an unknown effect."""
+    """An effect's parameters, as given or strong enough to be felt; InputError for an unknown effect."""
     known = felt_effects()
     if name not in known:
         raise InputError(f"effect {name}", "cannot be felt in a played world", nearest(name, known))
@@ -48,8 +47,7 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
 
 
 def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, Surroundings]:
-    """Rig, blocks and surroundings under the scene effects among these, with pads stiff enough to be
-    played."""
+    """Rig, blocks and surroundings under the scene effects among these, with pads stiff enough to play."""
     hand, around, blocks = scene_of(rig, blocks, effects)
     stiff = {n: getattr(hand.fingertip, n) for n in ("normal_stiffness", "shear_stiffness")}
     pads = {n: float(np.clip(v, SOFTEST, finite_stiffness(np.inf))) for n, v in stiff.items()}
@@ -60,8 +58,7 @@ def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, 
 def sensed(
     effects: Values, t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig
 ) -> np.ndarray:
-    """Forces (n, 2, 2) [N] read by sensors with these effects, for a stretch of motion at times t (n,)
-    [s]."""
+    """Forces (n, 2, 2) [N] read by sensors with these effects, during a motion at times t (n,) [s]."""
     nothing, known = np.zeros(t.size), felt_effects()
     mine = {name: values for name, values in effects.items() if known[name].acts_on == "sensing"}
     truth = Performance(t, position, velocity, force, np.zeros(0), rig, nothing, nothing + 1.0)

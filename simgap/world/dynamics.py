@@ -30,12 +30,9 @@ FADE = 2e-5  # numerics: m; depth over which damping fades in, so that an impact
 
 
 def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) -> Array:
-    """Normal force [N] of a spring that only pushes, 0 out of contact.
-
-    `depth` [m] is positive inside, `rate` [m/s] is its time derivative. A Kelvin-Voigt element whose damping
-    [N s/m] fades in with depth, as in Hunt & Crossley, "Coefficient of restitution interpreted as damping in
-    vibroimpact", J. Appl. Mech. 42 (1975): constant damping would make the force jump at touch and pull at
-    separation."""
+    """Normal force [N] of a spring that only pushes, at `depth` [m] inside. Its damping [N s/m] fades in with
+    depth, as in Hunt & Crossley, J. Appl. Mech. 42 (1975): constant damping would make the force jump at
+    touch and pull at separation."""
     depth = jnp.maximum(depth, 0.0)
     faded = damping * jnp.minimum(depth / FADE, 1.0)
     return jnp.maximum(stiffness * depth + faded * rate, 0.0)
@@ -43,13 +40,10 @@ def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) ->
 
 def friction(stiffness: Array, damping: Array, deflection: Array, rate: Array,
              bound: Array) -> tuple[Array, Array]:  # fmt: skip
-    """Tangential force [N] and the remaining elastic deflection [m], by return mapping.
-
-    The contact sticks through a spring from its anchor: a constant load below `bound` (friction coefficient
-    times normal force) holds at a constant deflection forever. Beyond the bound the anchor is dragged along
-    so that the spring carries exactly the bound (elastic predictor and return mapping: Simo & Hughes,
-    Computational Inelasticity, 1998, chapter 1; the contact model of Cundall & Strack, Géotechnique 29,
-    1979). Without contact the deflection is 0."""
+    """Tangential force [N] and the remaining elastic deflection [m]: the contact sticks through a spring from
+    its anchor, which beyond `bound` (friction coefficient times normal force) is dragged along (return
+    mapping: Simo & Hughes, Computational Inelasticity, 1998, chapter 1; Cundall & Strack, Géotechnique 29,
+    1979)."""
     limit = bound / stiffness
     deflection = jnp.clip(deflection, -limit, limit)
     return jnp.clip(stiffness * deflection + damping * rate, -bound, bound), deflection
@@ -179,8 +173,7 @@ def resting_state(physics: Physics, x: Sequence[Scalar], y: Sequence[Scalar]) ->
 
 
 def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
-    """Contact forces in a configuration, and the state with the anchors of slipping contacts dragged
-    along."""
+    """Contact forces in a configuration, and the state with the anchors of slipping contacts dragged on."""
     n = len(state.x)
     force_x: list[Scalar] = [0.0] * n
     force_y: list[Scalar] = [-w for w in physics.weight]
@@ -242,11 +235,9 @@ def kick(physics: Physics, state: State, loads: Loads, h: Scalar) -> State:
 
 
 def substep(physics: Physics, state: State, tips: Tips, h: Scalar) -> State:
-    """One step of h [s], with the tips given at its middle: half drift, kick, half drift.
-
-    The position form of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical Integration,
-    2006, section I.1): second order, symplectic without dissipation, one force evaluation per step. Stable
-    for h times the fastest frequency below 2."""
+    """One step of h [s], with the tips given at its middle: half drift, kick, half drift. The position form
+    of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical Integration, 2006, section
+    I.1), stable for h times the fastest frequency below 2."""
     state, loads = interact(physics, drift(state, h / 2), tips)
     return drift(kick(physics, state, loads, h), h / 2)
 
@@ -311,8 +302,7 @@ def _ground_depth(physics: Physics, state: State, i: int) -> tuple[Scalar, Scala
 
 
 def _ground(physics: Physics, state: State, i: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Forces fx, fy on a block [N], their normal part, and the new anchor [m] of its contact with the
-    ground."""
+    """Forces fx, fy of the ground on a block [N], their normal part, and the new anchor [m]."""
     depth, rate = _ground_depth(physics, state, i)
     damping = _damping(physics, physics.weight[i])
     push = normal_force(physics.support_stiffness, damping, depth, rate)
@@ -378,8 +368,8 @@ class Impedance(NamedTuple):
 
 @partial(jax.jit, static_argnames=("substeps",))
 def perform(physics: Physics, hand: Impedance, command: Array, state: State, substeps: int) -> Record:
-    """Perform a commanded motion: `command` (T, 4) is x1, y1, x2, y2 [m] per control period. Tips start at
-    rest at the first command. Commands are interpolated linearly."""
+    """Perform `command` (T, 4), x1, y1, x2, y2 [m] per control period, joined by lines, from rest at the
+    first."""
     h = CONTROL_PERIOD / substeps
     slope = jnp.diff(command, axis=0, append=command[-1:]) / CONTROL_PERIOD
     start = tips_of(jnp.concatenate([command[0], jnp.zeros(4)]))

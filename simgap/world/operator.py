@@ -201,8 +201,7 @@ class _Performer:
         return start + duration / 2, start + duration
 
     def _carry(self, move: Move, start: float, grasp: float) -> tuple[float, float]:
-        """Lift a block, carry it over its destination and press it down; the times [s] midway and at the
-        end."""
+        """Lift a block, carry it over its destination and press it down; the times [s] midway and then."""
         block, before = self.blocks[move.object], self.table.centre(move.object)
         target = self.table.carry(move, self.draw("misplacement"))
         rest, rise = self.table.centre(move.object), self.draw("rise")

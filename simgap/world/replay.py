@@ -54,8 +54,8 @@ class Motion:
 
 def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_position: np.ndarray,
            sd_velocity: np.ndarray) -> Motion:  # fmt: skip
-    """Smooth samples (T, axes) of position [m] and velocity [m/s], NaN where missing. `sd_*` (T, axes) is the
-    noise of one sample."""
+    """Smooth position [m] and velocity [m/s] (T, axes), NaN where missing, with noise `sd_*` of one
+    sample."""
     weights = [np.where(np.isfinite(z), 1.0 / (TOLERANCE * sd), 0.0)
                for z, sd in ((position, sd_position), (velocity, sd_velocity))]  # fmt: skip
     samples = [np.nan_to_num(position), np.nan_to_num(velocity)]
@@ -152,8 +152,8 @@ class Replay:
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            ) -> Replay:  # fmt: skip
-    """Drive the calibrated model with the motion of a recording. `boundaries` [s] between the subtasks locate
-    the blocks; without them the trial is segmented."""
+    """Drive the calibrated model with a recording's motion; `boundaries` [s] locate the blocks, else it is
+    segmented."""
     signals = task_space(trial, rig)
     if boundaries is None:
         found = segment([trial], task, rig)[0]

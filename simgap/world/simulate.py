@@ -134,11 +134,9 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
                     operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
                     alter: Callable[[Plan, np.random.Generator], Plan] | None = None,
                     ) -> list[SimulatedTrial]:  # fmt: skip
-    """Several performances of a task, one for each seed with its blocks of known properties.
-
-    They are integrated together, which costs far less than one after another, with the same result. `alter`
-    changes the operator's commands, given a random generator of its own. InputError if a block is missing or
-    out of the hand's reach."""
+    """Several performances of a task, one for each seed with its blocks, integrated together, which costs
+    less and changes nothing. `alter` changes the operator's commands, given a random generator of its own.
+    InputError if a block is missing or out of reach."""
     settings = operator or OperatorSettings()
     if not seeds:
         return []
@@ -204,8 +202,7 @@ def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks:
 
 
 def _boundaries(window: Window, block: int, t: np.ndarray, motion: Record) -> list[float]:
-    """The four times [s] of a move: both fingers touch, it leaves (or slides), meets (or stops), one lets
-    go."""
+    """The four times [s] of a move: both fingers touch, it leaves (slides), meets (stops), one lets go."""
     gripped = (motion.pads[:, :, block] > 0).all(axis=1)
     early, late = (t >= window.lift) & (t < window.middle), (t >= window.middle) & (t < window.end)
     if window.slide:
@@ -233,8 +230,7 @@ DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals 
 
 
 def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
-    """Contents of rig.toml, task.toml and actual.toml by file name. Trials have the fingertips' own columns,
-    in SI units, whatever those of the rig's recordings are."""
+    """Contents of rig.toml, without the columns of its recordings, task.toml and actual.toml by file name."""
     actual = {
         name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
         for name in task.objects
@@ -252,8 +248,7 @@ def trial_files(number: int, trial: Trial, boundaries: np.ndarray, seed: int) ->
 
 
 def trial_csv(trial: Trial) -> str:
-    """A trial as CSV: t and the hand's channels, rounded below the sensors' noise; missing samples are
-    empty."""
+    """A trial as CSV: t and the hand's channels, rounded below their noise; missing samples are empty."""
     rows = [f"{t:.6f}" for t in trial.t]
     for name, values in trial.channels.items():
         digits = DIGITS[name[0]]

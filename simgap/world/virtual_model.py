@@ -72,11 +72,9 @@ def finite_stiffness(stiffness: float) -> float:
 
 
 def substeps_for(constants: Physics, period: float) -> int:
-    """Number of substeps in a period [s] that keeps the integration well inside its stability limit.
-
-    By Gershgorin's theorem no block oscillates faster than sqrt((4 supports + both pads) / mass), the bound
-    in the middle of a stack. The step is at most 1.1 over that frequency (the limit is 2), 0.8 over the pads'
-    damping rate, and 0.25 ms. The number is a power of two, so that few programs are compiled."""
+    """Number of substeps, a power of two, in a period [s], well inside the stability limit. By Gershgorin's
+    theorem no block oscillates faster than sqrt((4 supports + both pads) / mass): the step is at most 1.1
+    over that (the limit is 2), 0.8 over the pads' damping rate, and 0.25 ms."""
     step = 2.5e-4
     pads = max(sum(map(float, constants.pad_normal)), sum(map(float, constants.pad_shear)))
     for w in constants.weight:
@@ -102,8 +100,7 @@ def advance(constants: Physics, state: State, before: Tips, after: Tips, dt: Sca
 @partial(jax.jit, static_argnames=("substeps",))
 def rollout(constants: Physics, state: State, positions: Array, velocities: Array, dt: Scalar,
             substeps: int) -> Record:  # fmt: skip
-    """Rollout from `state` as fingers move through positions and velocities (T, 2, 2) [m, m/s] every dt
-    [s]."""
+    """Rollout from `state` as fingers move through positions, velocities (T, 2, 2) [m, m/s] every dt [s]."""
 
     def one(carry: tuple[State, Tips], row: Array) -> tuple[tuple[State, Tips], Array]:
         state, before = carry
