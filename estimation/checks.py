@@ -6,8 +6,6 @@ p-value compares observed with replicated scatter (Gelman, Meng, Stern 1996). A 
 differ by more than sensors and hand explain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

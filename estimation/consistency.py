@@ -28,8 +28,6 @@ Nothing checks what all of these leave invariant: the distance of the fingers' b
 and the common length of all links.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product

@@ -13,8 +13,6 @@ grips. Slopes over the pads' give within a grip (`estimation.pads`) show these s
 whatever the block.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction

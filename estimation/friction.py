@@ -6,8 +6,6 @@ slips (`slip_evidence`) is at the limit, so the bound then equals mu. If a block
 its friction against the support (`ground_friction`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 

@@ -1,7 +1,5 @@
 """Block properties from aligned trials: posterior, friction and checks, in one result."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

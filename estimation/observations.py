@@ -12,8 +12,6 @@ grips, with the integrated autocorrelation time of the residuals (Huber 1964; So
 Each drawn alignment assigns every sample to one subtask.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

@@ -8,8 +8,6 @@ well. A landing, in which the load passes from fingers to ground within a few sa
 once more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -12,8 +12,6 @@ averaged. The standard deviation is that of the samples (Table 4's), the standar
 independent samples; the effects of autocorrelation, inertia and pads are not included.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Figures of an identification: corner plot, estimates against measurements, and predicted signals."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -16,8 +16,6 @@ drawn (`estimation.sampler`). The density of the scales is written once for NumP
 which finds its mode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache

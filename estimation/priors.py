@@ -7,8 +7,6 @@ Model error is a share of the quantity on which each channel's equation rests (`
 carried force, the pads' give along the grip, their shear deflection.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 PROPERTY_MEDIAN = {"weight": 0.5, "width": 0.02, "height": 0.02}  # prior: N, m, m

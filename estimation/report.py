@@ -1,7 +1,5 @@
 """Properties as JSON, text and tables, and compared with values measured apart from the trials."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from pathlib import Path

@@ -6,8 +6,6 @@ walkers that would be stuck in a tail. benchmarks/moves.py of commit f82105c com
 stretch move.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

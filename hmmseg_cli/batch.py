@@ -4,8 +4,6 @@ The result of a recording depends only on it, its task and its rig, not on the n
 order.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import logging

@@ -1,7 +1,5 @@
 """`hmmseg doctor`: versions and folders of the installation, for bug reports."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform

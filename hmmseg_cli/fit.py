@@ -4,8 +4,6 @@
 where unknown]}, or a CSV or TSV file with the columns trial, subtask and start [s].
 """
 
-from __future__ import annotations
-
 from hmmseg.errors import InputError
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import SequenceTask, read_task

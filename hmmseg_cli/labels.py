@@ -6,8 +6,6 @@ Tables (CSV, Parquet) get the columns `subtask_index` (from 0), `subtask`, `obje
 `language_persistent`, as its own tools write them, and the feature `boundary_sd`.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence

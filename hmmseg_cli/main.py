@@ -4,8 +4,6 @@
 refuses (memory, a disk). Any other exception is a bug and shows its traceback.
 """
 
-from __future__ import annotations
-
 import _thread
 import contextlib
 import gc

@@ -8,8 +8,6 @@ only unknown, which exact elimination finds without tolerances. Properties that 
 in all moves together, such as the heights in a tower of three.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Strict TOML and JSON tables: reading, and validation that reports a fault in one line."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Tables as files and data frames hold them, and numeric columns from them, before anything is mapped."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence

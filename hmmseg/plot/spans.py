@@ -1,7 +1,5 @@
 """Signals, or any channels, stacked over time, with the subtasks of a segmentation behind them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

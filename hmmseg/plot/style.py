@@ -1,7 +1,5 @@
 """Style that all figures share: colour-blind safe colours, fonts, sizes, saving."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

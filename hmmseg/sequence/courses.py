@@ -14,8 +14,6 @@ coarsened posterior (Miller and Dunson, J. Am. Stat. Assoc. 114, 2019) counts al
 `independent` observations.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -13,8 +13,6 @@ Durations are geometric with a learned mean: memoryless, so that cropping the st
 so that time alone decides little. Optional states may be skipped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -4,8 +4,6 @@ Each channel gives its value and an edge-preserving slope. Samples are averaged 
 trials of a model, so that rate, gaps and uneven sampling do not matter; an empty cell is NaN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

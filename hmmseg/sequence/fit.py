@@ -1,7 +1,5 @@
 """Fit a plain ordered task to trials: EM within the forced order, from labels where there are any."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ and their changes, weighted by the probabilities of the courses and that the bou
 shows which label would tell most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

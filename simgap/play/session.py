@@ -1,7 +1,5 @@
 """A session: one hand commands one or two worlds side by side, and is recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """A played world: the virtual model with perceptible effects, and a hand on springs that follows a
 command."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,8 +1,6 @@
 """Figures of a diagnosis: from its JSON where the gap is, which causes are suspected and how far it shrinks;
 from the signals, the recorded, simulated and corrected course where they differ most."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ A simulator is any object with `parameters`, `channels` and `simulate`; it inher
 `parameters` and `channels` may hold plain dicts (`simgap.simulators.user` reads them).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

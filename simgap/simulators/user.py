@@ -4,8 +4,6 @@ A user's code runs within `calling`, and what it returns is checked by `Checks`:
 is one line that names its file and line.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import inspect

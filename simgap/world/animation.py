@@ -1,7 +1,5 @@
 """Animation of fingers and blocks beside their force traces, as a GIF or an MP4."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -9,8 +9,6 @@ the same code is mapped over trials.
 Units: m, s, N, kg, rad. x right, y up; finger 0 is the left one and pushes right.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from functools import partial

@@ -6,8 +6,6 @@ commands beyond a contact into grip and pressing. Motions are minimum-jerk (Flas
 physiological tremor lies at 6-12 Hz.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any

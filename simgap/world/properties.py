@@ -1,7 +1,5 @@
 """Blocks of a virtual scene (given, read from a file or drawn at random) and the tabletop they stand on."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from copy import deepcopy

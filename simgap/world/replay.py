@@ -1,7 +1,5 @@
 """Replay: the finger motions of a recording drive the virtual model, which predicts forces and blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Synthetic trials: an operator performs a task, sensors record it, and contacts give the truth."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ comment may be the header; a row of units may follow the header. A truncated las
 zero bytes at the end, which recorders leave when they are interrupted.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator, Sequence

@@ -6,8 +6,6 @@ A folder's episodes are its recordings, `dataset#3`. Entries of a feature have t
 at each sample.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

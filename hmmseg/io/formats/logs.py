@@ -14,8 +14,6 @@ Files are read from the beginning, without index, summary or metadata.yaml: an u
 far as it goes, with a note. Topics of unknown types are left out, likewise.
 """
 
-from __future__ import annotations
-
 import bz2
 import dataclasses
 import json

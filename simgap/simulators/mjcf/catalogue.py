@@ -4,8 +4,6 @@ Usual sizes are shares of what the robot shows along the logs; torques are from 
 smoothed motion.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A MuJoCo model and its map, read and checked: the simulator, its logs, its candidates."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping, Sequence

@@ -6,8 +6,6 @@ encoder is on the joint's side. A motor is not seen, so where it is in the gap w
 from a free run along the whole log.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

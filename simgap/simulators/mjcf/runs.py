@@ -1,7 +1,5 @@
 """Many windows run by MuJoCo at once, from commands to channels."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import defaultdict
 from collections.abc import Mapping, Sequence

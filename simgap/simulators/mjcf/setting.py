@@ -4,8 +4,6 @@ A setting is a field of the compiled model, set in place and restored, or a para
 law (`laws.py`), or how commands are held between samples (`runs.py`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
