@@ -5,7 +5,7 @@ import re
 import tomllib
 import typing
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -35,27 +35,24 @@ class StrictTable(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
-
-Model = TypeVar("Model", bound=StrictTable)
-
-
-def validated(model: type[Model], table: dict[str, Any], where: str) -> Model:
-    """The table as this model; InputError names the key at fault and the nearest known one."""
-    try:
-        return model.model_validate(table)
-    except ValidationError as error:
-        first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        known = _known_keys(model, first["loc"])
-        raise InputError(f"{where}: key {key}", "unknown key", nearest(str(first["loc"][-1]), known))
-    if first["type"] == "missing":
-        raise InputError(f"{where}: key {key}", "missing", "a value")
-    problem = first["msg"].removeprefix("Value error, ")
-    if first["type"] != "value_error":
-        found = repr(first.get("input"))
-        problem += f" (found {found if len(found) < 100 else found[:100] + '...'})"
-    raise InputError(f"{where}: key {key}" if key else where, problem)
+    @classmethod
+    def validated(cls, table: dict[str, Any], where: str) -> Self:
+        """The table as this model; InputError names the key at fault and the nearest known one."""
+        try:
+            return cls.model_validate(table)
+        except ValidationError as error:
+            first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = _known_keys(cls, first["loc"])
+            raise InputError(f"{where}: key {key}", "unknown key", nearest(str(first["loc"][-1]), known))
+        if first["type"] == "missing":
+            raise InputError(f"{where}: key {key}", "missing", "a value")
+        problem = first["msg"].removeprefix("Value error, ")
+        if first["type"] != "value_error":
+            found = repr(first.get("input"))
+            problem += f" (found {found if len(found) < 100 else found[:100] + '...'})"
+        raise InputError(f"{where}: key {key}" if key else where, problem)
 
 
 def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:

@@ -79,22 +79,13 @@ MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch, so that quiet chan
 
 @dataclass(frozen=True)
 class Course:
-    """One alignment of all trials.
+    """One alignment of all trials."""
 
-    Attributes:
-        probability: [(num_cells, num_stretches), ...] of each stretch, on the coarse grid.
-        ends: (num_trials, num_stretches - 1), ends of stretches as shares of the trial.
-        cost: [a, b] (num_stretches + 1, ...) of stretches a <= k < b as one state, in nats with every cell
-            counted as one independent observation.
-        share: independent observations per cell, from the residuals.
-        seen: (num_stretches - 1,) log probability that a change is real, not one level cut in two.
-    """
-
-    probability: list[np.ndarray]
-    ends: np.ndarray
-    cost: np.ndarray
-    share: float
-    seen: np.ndarray
+    probability: list[np.ndarray]  # [(num_cells, num_stretches), ...] of each stretch, on the coarse grid
+    ends: np.ndarray  # (num_trials, num_stretches - 1) of stretches as shares of the trial
+    cost: np.ndarray  # [a, b] (num_stretches + 1, ...) [nats] of a <= k < b as one state, all cells counted
+    share: float  # independent observations per cell, from the residuals
+    seen: np.ndarray  # (num_stretches - 1,) log probability that a change is real, not one level cut in two
 
     @property
     def observations(self) -> float:
@@ -184,25 +175,15 @@ NEAR = 0.02  # chosen: share of a trial within which two boundaries are the same
 
 @dataclass(frozen=True)
 class Weighing:
-    """Prior weights of choices, learned on sequences of many kinds (`experiments.sequences learn`).
+    """Prior weights of choices, learned on sequences of many kinds (`experiments.sequences learn`)."""
 
-    Attributes:
-        independent: number of observations to which evidence is coarsened.
-        settled: log odds of an unnamed state after the last event.
-        shares: exponent of the share of the trial that each state but the last takes.
-        lag: scale of the Laplace law of boundaries about their change, as a share of the trial.
-        labelled: the same where labels tell the mean lag.
-        elsewhere: probability that a boundary is at no change at all.
-        unseen: prior weight of a change that the channels do not show, relative to one that they do.
-    """
-
-    independent: float
-    settled: float
-    shares: float
-    lag: float
-    labelled: float
-    elsewhere: float
-    unseen: float
+    independent: float  # number of observations to which evidence is coarsened
+    settled: float  # log odds of an unnamed state after the last event
+    shares: float  # exponent of the share of the trial that each state but the last takes
+    lag: float  # scale of the Laplace law of boundaries about their change, as a share of the trial
+    labelled: float  # the same where labels tell the mean lag
+    elsewhere: float  # probability that a boundary is at no change at all
+    unseen: float  # prior weight of a change that the channels do not show, relative to one that they do
 
 
 WEIGHING = Weighing(

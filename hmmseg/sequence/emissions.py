@@ -107,23 +107,15 @@ LEAST_SPREAD = 0.05  # chosen: share of a window's usual spread; labels align no
 
 @dataclass(frozen=True)
 class Detectors:
-    """Templates of all boundaries; windows have `2 * half` cells.
-
-    Attributes:
-        mean, spread: (num_boundaries, 2 * half, num_channels) of the template.
-        usual: (num_channels,) spread of windows anywhere.
-        jitter: (num_boundaries,) [cells] scatter of held-out labels in excess of their posterior.
-        weight: factor of the log-likelihood ratio, as neighbouring cells and channels are dependent.
-        state_weight: factor of the emissions' log-likelihoods next to it.
-    """
+    """Templates of all boundaries; windows have `2 * half` cells."""
 
     half: int
-    mean: np.ndarray
-    spread: np.ndarray
-    usual: np.ndarray
-    jitter: np.ndarray
-    weight: float = 0.0
-    state_weight: float = 1.0
+    mean: np.ndarray  # (num_boundaries, 2 * half, num_channels) of the template
+    spread: np.ndarray  # the same
+    usual: np.ndarray  # (num_channels,) spread of windows anywhere
+    jitter: np.ndarray  # (num_boundaries,) [cells] scatter of held-out labels in excess of their posterior
+    weight: float = 0.0  # of the log-likelihood ratio, as neighbouring cells and channels are dependent
+    state_weight: float = 1.0  # of the emissions' log-likelihoods next to it
 
     def crossing(self, values: np.ndarray) -> np.ndarray:
         """Log weights (num_cells - 1, num_boundaries) of crossing, from the features of a trial."""
@@ -189,20 +181,13 @@ def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
 
 @dataclass
 class Learner:
-    """EM over `values` [(num_cells, num_features), ...] of all trials.
+    """EM over the features of all trials."""
 
-    Args:
-        values: features of each trial, NaN where missing.
-        names: of the task's states; states of one name share emissions.
-        optional: (num_states,) whether a state may be skipped.
-        known: path (num_cells,) of each fully labelled trial, which stays fixed, else None.
-        allowed: (num_cells, num_states), -inf where labels forbid a state and 0 elsewhere; None without any.
-    """
-
-    values: list[np.ndarray]
-    names: Sequence[str]
-    optional: Sequence[bool]
-    known: list[np.ndarray | None] = field(default_factory=list)
+    values: list[np.ndarray]  # [(num_cells, num_features), ...], NaN where missing
+    names: Sequence[str]  # of the task's states; states of one name share emissions
+    optional: Sequence[bool]  # (num_states,) whether a state may be skipped
+    known: list[np.ndarray | None] = field(default_factory=list)  # fixed path of each fully labelled trial
+    # (num_cells, num_states), -inf where labels forbid a state and 0 elsewhere; None without any
     allowed: list[np.ndarray | None] = field(default_factory=list)
 
     def __post_init__(self) -> None:

@@ -40,15 +40,13 @@ SQUEEZED = 0.03  # chosen: share of the typical duration
 
 @dataclass(frozen=True)
 class NamedCourse:
-    """A course (`hmmseg.sequence.courses`) on the fine grid, and which of its changes are the boundaries.
-    `probability`: of the course; `naming` (num_boundaries, num_changes): that boundary b is change j, summing
-    to 1 over j; `shift` (num_boundaries, num_changes) [cells]: mean lag of labelled boundaries behind it."""
+    """A course (`hmmseg.sequence.courses`) on the fine grid, and which of its changes are the boundaries."""
 
-    probability: float
+    probability: float  # of the course
     emissions: StudentEmissions
     mean_cells: np.ndarray
-    naming: np.ndarray
-    shift: np.ndarray
+    naming: np.ndarray  # (num_boundaries, num_changes) probability that boundary b is change j
+    shift: np.ndarray  # (num_boundaries, num_changes) [cells] mean lag of labelled boundaries behind it
 
     def align(self, trial: SequenceFeatures) -> AlignmentPosterior:
         """Posterior alignment; InfeasibleAlignment for fewer cells than stretches."""
@@ -64,27 +62,22 @@ class SequenceModel(Tabled):
     Unlabelled trials may show one more state than the task names, the `settled` one: recordings run on after
     the last event, and what follows (decay, rest) belongs to the last subtask but looks different. Unless two
     trials are fully labelled, the model keeps several `courses`, and boundaries are mixtures over them.
-
-    Attributes:
-        mean_cells, presence: (num_states,) mean duration [cells], and probability of an optional state.
-        typical: (num_states,) median duration [cells] in the training trials.
-        usual_scores: (2, 2) median and width of the two scores of `misfit` in the training trials.
-        courses: alternative alignments, most probable first.
-        lag: (num_boundaries,) [cells] scale of the Laplace law of boundaries about their change.
-        sure: (num_boundaries,) probability that the boundaries of this model are the task's.
     """
 
     task: SequenceTask
     mapping: FeatureMap
     emissions: StudentEmissions
-    mean_cells: np.ndarray
-    presence: np.ndarray
+    mean_cells: np.ndarray  # (num_states,) mean duration [cells]
+    presence: np.ndarray  # (num_states,) probability of an optional state
     settled: bool
     detectors: Detectors | None
-    typical: np.ndarray
+    typical: np.ndarray  # (num_states,) median duration [cells] in the training trials
+    # (2, 2) median and width of the two scores of `misfit` in the training trials
     usual_scores: np.ndarray = field(default_factory=lambda: np.tile([0.0, np.inf], (2, 1)))
-    courses: tuple[NamedCourse, ...] = ()
+    courses: tuple[NamedCourse, ...] = ()  # alternative alignments, most probable first
+    # (num_boundaries,) [cells] scale of the Laplace law of boundaries about their change
     lag: np.ndarray = field(default_factory=lambda: np.empty(0))
+    # (num_boundaries,) probability that the boundaries of this model are the task's
     sure: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def tables(self) -> list[Table]:

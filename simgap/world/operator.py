@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator
 
 from hmmseg.io.rig import Rig
-from hmmseg.io.schema import Finite, FinitePositive, StrictTable, read_json, read_toml, validated
+from hmmseg.io.schema import Finite, FinitePositive, StrictTable, read_json, read_toml
 from hmmseg.io.task import BlockTask, Move
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.properties import Blocks, Tabletop, lay_out
@@ -81,7 +81,7 @@ def read_operator(path: str | Path) -> OperatorSettings:
     """Settings from a TOML or JSON file: [low, high] or one number per name; InputError if invalid."""
     json = Path(path).suffix.lower() == ".json"
     table = read_json(path, "operator settings") if json else read_toml(path)
-    return validated(OperatorSettings, table, str(path))
+    return OperatorSettings.validated(table, str(path))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from hmmseg.errors import InputError
-from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable, read_toml, validated
+from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable, read_toml
 from hmmseg.io.units import Quantity
 from simgap.simulators.user import LONGEST
 
@@ -151,7 +151,7 @@ class Map(StrictTable):
 
 def read_map(path: Path) -> Map:
     """Read a map from a TOML file; InputError names the key at fault."""
-    return validated(Map, read_toml(path), str(path))
+    return Map.validated(read_toml(path), str(path))
 
 
 SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}
