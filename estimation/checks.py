@@ -36,13 +36,11 @@ MEANING = {
 
 @dataclass(frozen=True)
 class PredictiveCheck:
-    """Posterior-predictive p-value per channel, and warnings for small ones. `excess`: sd between grips
-    beyond the sensors' noise, posterior median, per channel (N, m, m); `repeats`: number of observations that
-    determine it, 0 if only the prior does."""
+    """Posterior-predictive p-value per channel, and warnings for small ones."""
 
     p_values: dict[str, float]
-    excess: dict[str, float]
-    repeats: dict[str, int]
+    excess: dict[str, float]  # sd between grips beyond the sensors' noise, posterior median [N, m, m]
+    repeats: dict[str, int]  # observations that determine it, 0 if only the prior does
     warnings: tuple[str, ...]
 
     def to_json(self) -> dict:

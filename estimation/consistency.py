@@ -56,14 +56,9 @@ WELL_MADE = {
 }  # fmt: skip
 # prior: sds of what is misstated, in the same units
 SIZE = {
-    "squeeze": 0.7,
-    "balance": 0.7,
-    "rigidity": 0.1,
-    "motion": 0.3,
-    "room": 0.02,
-    "support": 0.02,
+    "squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "support": 0.02,
     "level": 0.02,
-}
+}  # fmt: skip
 COARSE = 5e-4  # limit: m; of steps of positions: pads of usual stiffness give as much in a grip
 BRIEF = 5  # numerics: fewer samples may be a glitch
 FEWEST = 8  # numerics: least samples of a carry to determine a slope
@@ -86,16 +81,14 @@ class Grip:
 
 @dataclass(frozen=True)
 class Tie:
-    """One tie: its violation, and the properties that depend on it. `value` +- `error`: error of the scale;
-    `made`: sd of healthy hands that the rig itself admits, in addition to WELL_MADE; `properties` depend on
-    it; `text` describes the violation."""
+    """One tie: its violation, and the properties that depend on it."""
 
     kind: str
-    value: float
-    error: float
+    value: float  # error of the scale
+    error: float  # its uncertainty
     properties: tuple[str, ...]
-    text: str
-    made: float = 0.0
+    text: str  # describes the violation
+    made: float = 0.0  # sd of healthy hands that the rig itself admits, in addition to WELL_MADE
 
     @property
     def probability(self) -> float:
@@ -378,11 +371,10 @@ TELLING = 1.0  # limit: sd of the pads' share along the grip beyond which grips 
 
 @dataclass(frozen=True)
 class ForceScale:
-    """Posterior of the factor g by which vertical forces are read too large. `probability` that forces are
-    misread; `density` (len(GRID),) of log g if they are."""
+    """Posterior of the factor g by which vertical forces are read too large."""
 
-    probability: float
-    density: np.ndarray
+    probability: float  # that forces are misread
+    density: np.ndarray  # (len(GRID),) of log g if they are
 
     def corrected(self, chain: np.ndarray, weights: list[int], rng: np.random.Generator) -> np.ndarray:
         """Draws (walkers, steps, Q) with those of `weights` [N] divided by draws of g."""

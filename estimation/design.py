@@ -21,28 +21,9 @@ from math import gcd, lcm
 
 import numpy as np
 
-from estimation.observations import (
-    CHANNELS,
-    LEAST,
-    MIN_FREE,
-    Noise,
-    WeighedTrial,
-    autocorrelation_time,
-    channel_values,
-    free_forces,
-    gravity_factor,
-)
-from estimation.pads import (
-    SLOPE_SD,
-    UNSTATED,
-    middle_share,
-    misstated,
-    possible_share,
-    shared_error,
-    shear_give,
-    squeeze_give,
-    unit_pads,
-)
+from estimation import observations, pads
+from estimation.observations import Noise, WeighedTrial
+from estimation.pads import SLOPE_SD, UNSTATED
 from hmmseg.contact.decompose import FREE, PROPERTIES, height_equations, reduced
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
@@ -89,7 +70,7 @@ def _whole(row: Mapping[str, Fraction], order: Sequence[str]) -> Terms:
     return {k: sign * v // share for k, v in whole.items()}
 
 
-FORCE, DISTANCE, RISE = range(len(CHANNELS))
+FORCE, DISTANCE, RISE = range(len(observations.CHANNELS))
 
 
 @dataclass(frozen=True)
@@ -136,7 +117,7 @@ def coefficients_of(
     unknowns: Sequence[Unknown], objects: Sequence[str], rises: dict[int, Terms]
 ) -> np.ndarray:
     """Coefficients (num_moves, 3, Q) of the unknowns in each observation of a move."""
-    out = np.zeros((len(objects), len(CHANNELS), len(unknowns)))
+    out = np.zeros((len(objects), len(observations.CHANNELS), len(unknowns)))
     heights = [i for i, u in enumerate(unknowns) if u.prop == "height"]
     names = list(dict.fromkeys(name for i in heights for name in unknowns[i].terms))
     basis = np.array([[unknowns[i].terms.get(name, 0) for name in names] for i in heights], float)
@@ -160,14 +141,12 @@ UNLIKE = 0.3  # prior: difference between both pads, as a share of their common 
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One deviation of the hand: its name, prior standard deviation, and effect. `read(trial, rig, size)`
-    gives the task-space signals of a trial by a hand that deviates by `size` from the nominal rig; `step` is
-    a small deviation for finite differences."""
+    """One deviation of the hand."""
 
     name: str
-    sd: float
-    step: float
-    read: Callable[[Trial, Rig, float], Signals]
+    sd: float  # prior
+    step: float  # a small deviation for finite differences
+    read: Callable[[Trial, Rig, float], Signals]  # signals of a trial by a hand that deviates by a size
 
 
 def _with_channel(name: str, change: Callable[[np.ndarray, float], np.ndarray]):
@@ -191,19 +170,14 @@ def _longer_link(finger: int, link: int):
 
 @dataclass(frozen=True)
 class PadDoubt:
-    """Disagreement of recordings with the rig about both pads, along the grip or in shear.
+    """Disagreement of recordings with the rig about both pads, along the grip or in shear."""
 
-    Their compliance seems 1 + `share` times the nominal; `odds` is the probability that the rig is wrong by
-    that. `apart`: error common to all slopes. `give`: possible give of pads whose stiffness the rig leaves
-    unstated, according to the recordings; 0 if it states one. `usual`: typical force of one finger in a grip,
-    or where a block is put down [N]. `seen`: the share and its sd whatever the odds, infinite if unknown."""
-
-    share: float = 0.0
-    odds: float = 0.0
-    apart: float = 0.0
-    give: float = 0.0
-    usual: float = 1.0
-    seen: tuple[float, float] = (0.0, np.inf)
+    share: float = 0.0  # their compliance seems 1 + this times the nominal
+    odds: float = 0.0  # probability that the rig is wrong by that
+    apart: float = 0.0  # error common to all slopes
+    give: float = 0.0  # possible give of pads of unstated stiffness, according to the recordings
+    usual: float = 1.0  # [N] typical force of one finger in a grip, or where a block is put down
+    seen: tuple[float, float] = (0.0, np.inf)  # the share and its sd whatever the odds
 
     @property
     def extra_sd(self) -> float:
@@ -225,7 +199,9 @@ def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None)
             law = getattr(signals, f"f{name}")
             if usual is not None:
                 law = law * np.log(np.maximum(np.abs(law), 1e-3 * usual) / usual)
-            moved[name] = getattr(signals, name) - law * getattr(unit_pads(rig), f"{kind}{finger}") * size
+            moved[name] = (
+                getattr(signals, name) - law * getattr(pads.unit_pads(rig), f"{kind}{finger}") * size
+            )
         return replace(signals, **moved)
 
     return read
@@ -283,7 +259,7 @@ SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing"
 
 def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
-    values, out = {k: np.nan_to_num(v) for k, v in channel_values(signals, rig).items()}, []
+    values, out = {k: np.nan_to_num(v) for k, v in observations.channel_values(signals, rig).items()}, []
     for move in moves:
         counts = weighed.counts[move]
         means = {k: np.where(counts[k] > 0, w @ values[k], np.nan)
@@ -294,7 +270,7 @@ def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[i
 
 def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where absent."""
-    values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
+    values, out = observations.channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
         for k, (name, (_, reading)) in enumerate(SLOPES.items()):
             slope = weighed.slopes.get(move, {}).get(name)
@@ -327,10 +303,10 @@ def pad_doubts(
         stated = bool(np.isfinite(getattr(rig.fingertip, f"{kind}_stiffness")))
         own = np.isfinite(slopes) & (np.array([c for c, _ in SLOPES.values()]) == channel)
         shares, spread = sign * slopes[own], variance[own]
-        apart = shared_error(alike[own], spread)
-        middle, error = middle_share(shares, spread, 0.0) if shares.size else (0.0, np.inf)
-        share, odds = misstated(shares, spread, stated, admitted if stated else 0.0, apart)
-        give = 0.0 if stated else possible_share(shares, spread)
+        apart = pads.shared_error(alike[own], spread)
+        middle, error = pads.middle_share(shares, spread, 0.0) if shares.size else (0.0, np.inf)
+        share, odds = pads.misstated(shares, spread, stated, admitted if stated else 0.0, apart)
+        give = 0.0 if stated else pads.possible_share(shares, spread)
         out[kind] = PadDoubt(share, odds, apart, give, force, (middle, float(np.hypot(error, apart))))
     return out
 
@@ -354,11 +330,13 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
     gives = []
     for a in weighed:
-        squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
+        squeeze, shear = (
+            np.nan_to_num(give(a.signals, rig)) for give in (pads.squeeze_give, pads.shear_give)
+        )
         gives.append([(np.mean(w["distance"] @ squeeze), *(np.mean(w[k] @ shear) for k in
                       ("pickup", "force", "place"))) for w in a.grips.values()])  # fmt: skip
     grip, picked, carried, placed = np.moveaxis(np.array(gives), -1, 0)
-    hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
+    hanging = np.maximum(force, 1e-3) * (pads.unit_pads(rig).shear1 + pads.unit_pads(rig).shear2) / 4
     least = np.maximum(hanging, np.abs(placed - carried))
     rise = np.where(placed < picked, -1.0, 1.0) * np.maximum(np.abs(placed - picked), least)
     return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
@@ -370,7 +348,7 @@ def free_means(
     """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N]. A
     zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and the
     rig's own bias allow, is known in a grip no better than these stretches agree."""
-    mean = np.stack([free_forces(a.signals, a) for a in weighed])
+    mean = np.stack([observations.free_forces(a.signals, a) for a in weighed])
     count = np.array([max(a.free_count, 1.0) for a in weighed])
     of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
     variance = of_sample[None, :] / count[:, None] + np.array([a.rounding**2 for a in weighed])
@@ -381,12 +359,14 @@ def free_means(
 def _zeros(a: WeighedTrial, free_steps: Sequence[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean times (N,) of halves of free stretches of a trial, mean forces (N, 4) there, and their errors."""
     spans = [np.flatnonzero((a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0)) for k in free_steps]
-    halves = [half for span in spans for half in np.array_split(span, 2) if half.size >= MIN_FREE]
+    halves = [
+        half for span in spans for half in np.array_split(span, 2) if half.size >= observations.MIN_FREE
+    ]
     if not halves:
         return np.zeros(1), np.zeros((1, 4)), np.ones((1, 4))
     each = [np.stack([getattr(a.signals, name)[half] for name in FORCE_CHANNELS]) for half in halves]
-    noise = [[r.var() * autocorrelation_time([r - r.mean()]) for r in four] for four in each]
-    spread = np.median(noise, axis=0) + LEAST**2
+    noise = [[r.var() * observations.autocorrelation_time([r - r.mean()]) for r in four] for four in each]
+    spread = np.median(noise, axis=0) + observations.LEAST**2
     errors = np.sqrt([spread / half.size + a.rounding**2 for half in halves])
     means = np.array([four.mean(axis=1) for four in each])
     return np.array([a.signals.t[half].mean() for half in halves]), means, errors
@@ -442,39 +422,31 @@ def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndar
 
 @dataclass(frozen=True)
 class Design:
-    """Arrays of the linear-Gaussian core; K observations, Q unknowns, N deviations of the hand.
-
-    `mean`, `variance` (K,) of the observations, drawn alignments combined; `coefficients` (K, Q); `shifts`
-    (K, N) per standard deviation of each deviation; `channel` (K,): index into CHANNELS; `unit` (K,): of the
-    shares of model error; `trial`, `move` (K,): source; `slope` (K,): whether a slope over the give rather
-    than a mean (its shares are those of the mean). `slope_sd` (3,): by channel, the error common to all
-    slopes and that of each. `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4,
-    N): forces in free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force
-    biases that free motion shows and the rig does not admit; `doubts`: the same for the pads; `level_rises`:
-    mean recorded rise by move between equal heights [m]; `moved` (4,): how far the forces' zeros move within
-    a trial [N]."""
+    """Arrays of the linear-Gaussian core; K observations, Q unknowns, N deviations of the hand."""
 
     unknowns: tuple[Unknown, ...]
     nuisances: tuple[Nuisance, ...]
-    mean: np.ndarray
-    variance: np.ndarray
-    coefficients: np.ndarray
-    shifts: np.ndarray
-    channel: np.ndarray
-    unit: np.ndarray
-    trial: np.ndarray
-    move: np.ndarray
-    slope: np.ndarray
-    free_mean: np.ndarray
-    free_variance: np.ndarray
-    free_shifts: np.ndarray
-    scale_count: np.ndarray
-    slope_sd: np.ndarray = field(default_factory=lambda: np.full(len(CHANNELS), SLOPE_SD))
-    unexpected: tuple[Nuisance, ...] = ()
+    mean: np.ndarray  # (K,) of the observations, drawn alignments combined
+    variance: np.ndarray  # (K,) likewise
+    coefficients: np.ndarray  # (K, Q)
+    shifts: np.ndarray  # (K, N) per standard deviation of each deviation
+    channel: np.ndarray  # (K,) index into CHANNELS
+    unit: np.ndarray  # (K,) of the shares of model error
+    trial: np.ndarray  # (K,) source
+    move: np.ndarray  # (K,) source
+    slope: np.ndarray  # (K,) whether a slope over the give, with the shares of the mean, rather than a mean
+    free_mean: np.ndarray  # (num_trials, 4) forces in free motion
+    free_variance: np.ndarray  # (num_trials, 4)
+    free_shifts: np.ndarray  # (num_trials, 4, N)
+    scale_count: np.ndarray  # (3,) samples behind each noise variance
+    # (3,) by channel, the error common to all slopes and that of each
+    slope_sd: np.ndarray = field(default_factory=lambda: np.full(len(observations.CHANNELS), SLOPE_SD))
+    unexpected: tuple[Nuisance, ...] = ()  # force biases that free motion shows and the rig does not admit
     doubts: Mapping[str, PadDoubt] = field(
-        default_factory=lambda: {"normal": PadDoubt(), "shear": PadDoubt()}
+        default_factory=lambda: dict.fromkeys(("normal", "shear"), PadDoubt())
     )
-    level_rises: dict[int, float] = field(default_factory=dict)
+    level_rises: dict[int, float] = field(default_factory=dict)  # [m] mean, of moves between equal heights
+    # (4,) [N] how far the forces' zeros move within a trial
     moved: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
     @property
@@ -484,7 +456,7 @@ class Design:
 
     def repeats(self) -> np.ndarray:
         """By channel (3,): number of means in excess of the unknowns, which determine the scatter."""
-        counts = np.bincount(self.channel[~self.slope], minlength=len(CHANNELS))
+        counts = np.bincount(self.channel[~self.slope], minlength=len(observations.CHANNELS))
         return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
 
@@ -497,7 +469,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     raw = np.stack([observe(a.signals, a, rig, moves) for a in weighed])  # T, S, M, 3
     variance = np.stack([sampling_variance(a, noise, moves) for a in weighed])
     factor = np.stack(
-        [[a.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in weighed]
+        [[a.grips[m]["force"] @ observations.gravity_factor(a.signals, rig) for m in moves] for a in weighed]
     )
     valid = np.isfinite(raw) & np.isfinite(variance)
     there = valid.mean(axis=1) > 0.5  # of the alignments
@@ -530,7 +502,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
             read, per = thin(deviation.read(trial, rig, deviation.step), rate), deviation.sd / deviation.step
             shifts[i, ..., j] = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) * per
             slope_shifts[i, ..., j] = np.nan_to_num(slopes[i] - observe_slopes(read, a, rig, moves)) * per
-            free_shifts[i, :, j] = (free_mean[i] - free_forces(read, a)) * per
+            free_shifts[i, :, j] = (free_mean[i] - observations.free_forces(read, a)) * per
     where, steep = np.nonzero(there), np.nonzero(np.isfinite(slopes))
     mean, spread, rows = _combined(raw, variance, valid, coefficients, where)
     rows = np.concatenate([rows, np.zeros((steep[0].size, len(unknowns)))])

@@ -92,17 +92,15 @@ NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
 
 @dataclass(frozen=True)
 class Stretch:
-    """One finger on one resting block, arrays (num_samples,). `t` [s], `anchor` [m] (height less nominal
-    shear deflection) and its noise `sd` [m], `shear` [N], signed `ratio` of shear to normal force and its
-    noise `ratio_sd`; `compliance` [m/N]: standard deviation of the pad's compliance error."""
+    """One finger on one resting block, arrays (num_samples,)."""
 
-    t: np.ndarray
-    anchor: np.ndarray
-    sd: np.ndarray
-    shear: np.ndarray
-    ratio: np.ndarray
+    t: np.ndarray  # [s]
+    anchor: np.ndarray  # [m] height less nominal shear deflection
+    sd: np.ndarray  # [m] its noise
+    shear: np.ndarray  # [N]
+    ratio: np.ndarray  # of shear to normal force, signed
     ratio_sd: np.ndarray
-    compliance: float
+    compliance: float  # [m/N] standard deviation of the pad's compliance error
 
 
 @dataclass(frozen=True)
@@ -244,18 +242,14 @@ DRAWS = 2000  # numerics: of each coefficient
 
 @dataclass(frozen=True)
 class FrictionPosterior:
-    """Friction coefficient of the fingers on one block.
+    """Friction coefficient of the fingers on one block."""
 
-    `lower_bound`: 5 % quantile of `bound_draws` (num_draws,), the posterior of the largest ratio; None with a
-    `reason` if the block was not held. `mu_draws` (num_draws,) only if slip was seen, otherwise `reason`
-    tells why there is no value. `ground`: friction of the block on its support, if it was slid."""
-
-    lower_bound: float | None
-    bound_draws: np.ndarray | None = None
-    mu_draws: np.ndarray | None = None
+    lower_bound: float | None  # 5 % quantile of `bound_draws`; None if the block was not held
+    bound_draws: np.ndarray | None = None  # (num_draws,) of the largest ratio
+    mu_draws: np.ndarray | None = None  # (num_draws,) only if slip was seen
     slip: SlipEvidence | None = None
-    reason: str | None = None
-    ground: GroundFriction | None = None
+    reason: str | None = None  # why there is no value, or no bound
+    ground: GroundFriction | None = None  # of the block on its support, if it was slid
 
     def to_json(self) -> dict:
         """The entry `friction` of one block in the JSON of `identify`."""

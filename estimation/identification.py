@@ -6,17 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimation.checks import (
-    PredictiveCheck,
-    check,
-    dense,
-    misfits,
-    soft_pads,
-    unchecked,
-    unnamed,
-    unrepeated,
-    unstated_pads,
-)
+from estimation import checks
 from estimation.consistency import contradictions, force_scale
 from estimation.design import Design, Unknown, build, without_drift, zero_drift
 from estimation.friction import FrictionPosterior, friction_posteriors
@@ -59,7 +49,7 @@ class Identification(Tabled):
     sampled: Draws | None
     friction: dict[str, FrictionPosterior]
     reasons: dict[str, str]
-    predictive: PredictiveCheck | None
+    predictive: checks.PredictiveCheck | None
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     centres: Mapping[tuple[str, str], float] = field(default_factory=dict)
@@ -181,11 +171,11 @@ def identify_aligned(
     friction = _friction(aligned, weighed, design, sampled, rng)
     reasons = _reasons(aligned, design, friction)
     predictive, contradicted, centres, kept = None, {}, {}, list[int]()
-    warnings, notes = misfits(aligned), list[str]()
+    warnings, notes = checks.misfits(aligned), list[str]()
     if post is not None and sampled is not None and sampled.converged:
-        predictive = check(post, sampled, rng)
+        predictive = checks.check(post, sampled, rng)
         warnings += predictive.warnings
-        notes = [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
+        notes = [*checks.unrepeated(design), *checks.unstated_pads(design), *checks.unchecked(design, rig)]
         contradicted = contradictions(aligned, weighed, design)
         rejected = contradicted | impossible(design, sampled)
         reasons |= rejected
@@ -217,7 +207,11 @@ def identify_aligned(
     warnings += [f"the zero of {name} {text.format(size)}" for text, sizes in (drifts, moves)
                  for name, size in zip(FORCE_CHANNELS, sizes, strict=True) if size > 0]  # fmt: skip
     warnings += dict.fromkeys(contradicted.values())
-    warnings += [*soft_pads(design, rig), *unnamed(task, design), *dense(task, rig, means)]
+    warnings += [
+        *checks.soft_pads(design, rig),
+        *checks.unnamed(task, design),
+        *checks.dense(task, rig, means),
+    ]
     friction = {
         k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
     }

@@ -37,11 +37,10 @@ STATED = 4.0  # prior: samples that a stated noise is worth: it is off by a fact
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of one effective sample, and the number of samples that it was estimated from. By the kind of
-    mean of a grip ("force", "distance", "pickup", "place"), and by force channel in free motion."""
+    """Variance of one effective sample, by kind of mean (KEYS) and of each force in free motion."""
 
     variance: dict[str, float]
-    count: dict[str, float]
+    count: dict[str, float]  # samples that it was estimated from
 
 
 def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str, float]:
@@ -191,25 +190,20 @@ def robust_weights(
 
 @dataclass(frozen=True, repr=False)
 class WeighedTrial(Brief):
-    """One trial thinned for estimation: its `signals`, and sample weights of each grip's means.
-
-    `masks` (num_alignments, num_subtasks, num_timesteps): samples of the subtasks in drawn alignments.
-    `grips[m]` maps "force", "distance", "pickup" and "place" to weights (num_alignments, num_timesteps) that
-    sum to 1 over the samples (all 0: nothing recorded), `counts[m]` to effective sample numbers
-    (num_alignments,); `free`: weights (num_timesteps,) over free motion, of `free_count` samples;
-    `free_robust` (4, num_timesteps): those of each force, robust to a finger that touches early. `slopes[m]`
-    maps "distance" and "rise" to slopes over the pads' give within the grip, and "landing" to that of heights
-    from the touch to the place, where seen. `rounding` (4,): error of each force that no average removes [N].
-    """
+    """One trial thinned for estimation: its `signals`, and sample weights of each grip's means."""
 
     signals: Signals
-    masks: np.ndarray
+    masks: np.ndarray  # (num_alignments, num_subtasks, num_timesteps) samples in drawn alignments
+    # by move and KEYS weights (num_alignments, num_timesteps), 0 where nothing was recorded
     grips: dict[int, dict[str, np.ndarray]]
-    counts: dict[int, dict[str, np.ndarray]]
-    free: np.ndarray
+    counts: dict[int, dict[str, np.ndarray]]  # likewise effective sample numbers (num_alignments,)
+    free: np.ndarray  # weights (num_timesteps,) over free motion
+    # (4, num_timesteps) the same of each force, robust to a finger that touches early
     free_robust: np.ndarray
-    free_count: float
+    free_count: float  # samples of free motion
+    # by move over the pads' give: "distance" and "rise" within the grip, and "landing" from touch to place
     slopes: dict[int, dict[str, Slope]] = field(default_factory=dict)
+    # (4,) [N] error of each force that no average removes
     rounding: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
 

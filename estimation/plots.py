@@ -24,13 +24,12 @@ from hmmseg.segmentation.spans import Segmentation
 
 @dataclass(frozen=True)
 class Prediction:
-    """A recorded signal minus its prediction, and the predictive band of a new sample, (num_timesteps,).
-    `low` and `high` bound the central 90 % about 0, NaN without a prediction; in units of the `label`."""
+    """A recorded signal minus its prediction, and the predictive band of a new sample, (num_timesteps,)."""
 
     label: str
     observed: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    low: np.ndarray  # of the central 90 % about 0, NaN without a prediction
+    high: np.ndarray  # likewise
 
     @property
     def coverage(self) -> float:

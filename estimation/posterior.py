@@ -36,23 +36,19 @@ FARTHEST = 9.0  # limit: of any scale from its prior median, all logarithms
 class Model(NamedTuple):
     """A design as one linear model with S coefficients b = (q, z, e, f); arrays of NumPy or JAX.
 
-    `residual` (K,) = `matrix` (K, S) b + noise of variance s^2 `variance` (K,) + (k `unit` (K,))^2, rows
-    independent; `of` (3, K): 1 if a row is of a channel. `products` (K, S (S + 1) / 2) of its columns.
-    `precision` (S, S), `gradient` (S,): information on b that does not depend on the scales, from the prior
-    of the deviations and free motion; `shares` (6, S): 1 if a coefficient is a share; `least` (6,): prior
-    variances of the shares if grips do not differ; `scale_sd` (3,): prior sds of log s."""
+    `residual` = `matrix` b + noise of variance s^2 `variance` + (k `unit`)^2, rows independent."""
 
-    residual: Any
-    matrix: Any
-    products: Any
-    variance: Any
-    unit: Any
-    of: Any
-    precision: Any
-    gradient: Any
-    shares: Any
-    least: Any
-    scale_sd: Any
+    residual: Any  # (K,)
+    matrix: Any  # (K, S)
+    products: Any  # (K, S (S + 1) / 2) of the matrix's columns
+    variance: Any  # (K,)
+    unit: Any  # (K,)
+    of: Any  # (3, K): 1 if a row is of a channel
+    precision: Any  # (S, S) of b from the prior of deviations and free motion, whatever the scales
+    gradient: Any  # (S,) likewise
+    shares: Any  # (6, S): 1 if a coefficient is a share
+    least: Any  # (6,) prior variances of the shares if grips do not differ
+    scale_sd: Any  # (3,) prior sds of log s
 
 
 def normal_equations(theta: Any, model: Model, xp: ModuleType = np) -> tuple[Any, Any, Any]:

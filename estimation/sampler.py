@@ -25,12 +25,11 @@ STEP, REACH = 0.25, (-10.0, 10.0)  # numerics: of the grid, in log(share / its p
 
 @dataclass(frozen=True)
 class Proposal:
-    """Multivariate t of the noise scales, `mean` (3,) and `chol` (3, 3); grid densities of the scatters.
-    `cells` (3, G): probabilities of the grid's intervals, of width STEP from REACH[0] on."""
+    """Multivariate t of the noise scales, and grid densities of the scatters."""
 
-    mean: np.ndarray
-    chol: np.ndarray
-    cells: np.ndarray
+    mean: np.ndarray  # (3,)
+    chol: np.ndarray  # (3, 3)
+    cells: np.ndarray  # (3, G) probabilities of the grid's intervals, of width STEP from REACH[0] on
 
     def draw(self, num: int, random: np.random.RandomState) -> np.ndarray:
         """Proposals (num, 6)."""
@@ -90,24 +89,18 @@ MIN_EFFICIENCY = 0.05  # numerics: least effective share of draws after weightin
 
 @dataclass(frozen=True, repr=False)
 class Draws(Brief):
-    """Posterior draws of the scales (walkers, steps, 6) and unknowns (walkers, steps, Q) [N, m].
+    """Posterior draws of the scales and unknowns."""
 
-    `ess`: smallest effective sample size over scales (emcee's autocorrelation time); `rhat`: largest split
-    R-hat over scales, with walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 6): model error
-    common to all grips; `deviations` (walkers, steps, N) of the hand. `prior_ess`: effective share of draws
-    after weighting by the unknowns' priors. `impossible`: unknowns all of whose draws have an impossible
-    sign."""
-
-    scales: np.ndarray
-    chain: np.ndarray
-    deviations: np.ndarray
-    shares: np.ndarray
-    ess: float
-    rhat: float
+    scales: np.ndarray  # (walkers, steps, 6)
+    chain: np.ndarray  # (walkers, steps, Q) of the unknowns [N, m]
+    deviations: np.ndarray  # (walkers, steps, N) of the hand
+    shares: np.ndarray  # (walkers, steps, 6) model error common to all grips
+    ess: float  # smallest over scales, by emcee's autocorrelation time
+    rhat: float  # largest split R-hat over scales, with walkers as chains (Gelman et al. 2013)
     acceptance: float
     steps: int
-    prior_ess: float
-    impossible: tuple[int, ...] = ()
+    prior_ess: float  # effective share of draws after weighting by the unknowns' priors
+    impossible: tuple[int, ...] = ()  # unknowns all of whose draws have an impossible sign
 
     @property
     def flat(self) -> np.ndarray:

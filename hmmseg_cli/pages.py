@@ -16,16 +16,7 @@ from estimation.identification import Identification
 from estimation.plots import draw_check, draw_corner, draw_estimates
 from estimation.report import INTERVALS, Actual, property_rows
 from hmmseg.io.trial import Trial
-from hmmseg.numbers import (
-    SHOWN,
-    between,
-    estimate,
-    interval,
-    percent,
-    plain,
-    property_shown_as,
-    shown_as,
-)
+from hmmseg.numbers import SHOWN, between, estimate, interval, percent, plain, property_shown_as, shown_as
 from hmmseg.segmentation.spans import Segmentation
 from simgap.report import finding
 from simgap.report.finding import plain_name
@@ -122,17 +113,17 @@ SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # 
 
 @dataclass(frozen=True)
 class Setting:
-    """Contents of a page apart from the body. `files`: recordings; `rig`: its pads; `measured`: independent
-    values of properties; `shows`: signature of each effect; `own`: by part of a robot, the unit in which its
-    logs give a quantity that they do not give in SI; `motion`: place of the motion to run next."""
+    """Contents of a page apart from the body."""
 
-    files: Sequence[str]
-    rig: Mapping[str, Any] = field(default_factory=dict)
+    files: Sequence[str]  # recordings
+    rig: Mapping[str, Any] = field(default_factory=dict)  # its pads
+    # independent values of properties
     measured: Mapping[str, Mapping[str, tuple[float, float]]] | None = None
-    shows: Mapping[str, str] = field(default_factory=dict)
+    shows: Mapping[str, str] = field(default_factory=dict)  # signature of each effect
     warnings: Sequence[str] = ()
+    # by part of a robot, the unit in which its logs give a quantity
     own: Mapping[str, Own] = field(default_factory=dict)
-    motion: str = ""
+    motion: str = ""  # place of the motion to run next
 
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:

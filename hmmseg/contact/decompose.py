@@ -27,20 +27,16 @@ FINGERS = ("finger1", "finger2")
 
 @dataclass(frozen=True)
 class Subtask:
-    """One step of a task, between two changes of the active constraints of the hand and its object.
-
-    `state`: the contact state; the paper calls every support the ground. `move`: 0-based index in
-    `task.performed` of its move (None in a plain ordered task); a pregrasp belongs to the first move, a
-    release to the move it ends. `support`: what the held object touches besides the fingers, None while free
-    or lifted; `beneath`: objects from the support down to the ground."""
+    """One step of a task, between two changes of the active constraints of the hand and its object."""
 
     index: int
     name: str
     object: str | None
-    state: str
+    state: str  # the contact state; every support is called ground, as in the paper
+    # 0-based, in `task.performed`; a pregrasp is of the first, a release of the move it ends
     move: int | None
-    support: str | None = None
-    beneath: tuple[str, ...] = ()
+    support: str | None = None  # what the held object touches besides the fingers
+    beneath: tuple[str, ...] = ()  # objects from the support down to the ground
 
     @property
     def label(self) -> str:
@@ -193,14 +189,12 @@ def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One way to learn a property: the signals of the subtasks required together. `bound`: only a lower bound
-    (a friction coefficient without slip). `given`: properties, determined elsewhere, that are required.
-    `condition`: what the recording must show in addition, if anything."""
+    """One way to learn a property: the signals of the subtasks required together."""
 
     sources: tuple[Source, ...]
-    bound: bool = False
-    given: tuple[Unknown, ...] = ()
-    condition: str | None = None
+    bound: bool = False  # only a lower bound, as of friction without slip
+    given: tuple[Unknown, ...] = ()  # properties, determined elsewhere, that are required
+    condition: str | None = None  # what the recording must show in addition
 
     @property
     def subtasks(self) -> tuple[int, ...]:
@@ -221,13 +215,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Property:
-    """A property of an object: every way to learn it, or the reason why there is none. Each of `evidence`
-    suffices by itself, the strongest first. `name` is weight, width, height, friction (of the fingers on the
-    object) or friction_on_SUPPORT."""
+    """A property of an object: every way to learn it, or the reason why there is none."""
 
     object: str
-    name: str
-    evidence: tuple[Evidence, ...]
+    name: str  # weight, width, height, friction (of the fingers on it) or friction_on_SUPPORT
+    evidence: tuple[Evidence, ...]  # each suffices by itself, the strongest first
     reason: str | None = None
 
     @property

@@ -120,8 +120,8 @@ def direction(axis: str) -> Any:
 
 
 class Finger(StrictTable):
-    """One planar two-link finger with absolute link angles (parallelogram linkage). tip = base + L1 (cos q1,
-    sin q1) + L2 (cos q2, sin q2), all in m."""
+    """One planar two-link finger with absolute link angles (parallelogram linkage): tip = base + sum of L
+    (cos q, sin q), in m."""
 
     base: tuple[Finite, Finite]
     links: tuple[Link, Link]

@@ -199,25 +199,21 @@ WEIGHING = Weighing(
 
 @dataclass(frozen=True)
 class Naming:
-    """Which changes of one course are the named boundaries: `log_evidence` [nats], averaged over all choices;
-    `probability` (num_boundaries, num_changes) that boundary b is change j; `settled` (num_changes,) that a
-    settled state begins at change j."""
+    """Which changes of one course are the named boundaries."""
 
-    log_evidence: float
-    probability: np.ndarray
-    settled: np.ndarray
+    log_evidence: float  # [nats] averaged over all choices
+    probability: np.ndarray  # (num_boundaries, num_changes) that boundary b is change j
+    settled: np.ndarray  # (num_changes,) that a settled state begins at change j
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Changes of a `course` (its index) chosen as its task's boundaries: `ends`, numbered from 1, of the
-    named states, of the last one only if it is `settled` after it; `right` (num_boundaries,): probability
-    that each boundary is within NEAR of the chosen change."""
+    """Changes of one course chosen as its task's boundaries."""
 
-    course: int
-    ends: tuple[int, ...]
-    settled: bool
-    right: np.ndarray
+    course: int  # its index
+    ends: tuple[int, ...]  # changes, from 1, that end the named states, the last one only if settled
+    settled: bool  # whether a settled state follows the last named one
+    right: np.ndarray  # (num_boundaries,) probability that each is within NEAR of the chosen change
 
 
 def naming(

@@ -20,15 +20,13 @@ SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's durat
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """From channels to features, fixed once for all trials of a model. `step` [s]: width of a cell; `window`
-    [cells]: width of slopes; `center`, `scale` (num_features,): standardisation, the values of all channels
-    first, then their slopes."""
+    """From channels to features, fixed once for all trials of a model."""
 
     channels: tuple[str, ...]
-    step: float
-    window: int
-    center: np.ndarray
-    scale: np.ndarray
+    step: float  # [s] width of a cell
+    window: int  # [cells] width of slopes
+    center: np.ndarray  # (num_features,) values of all channels, then their slopes
+    scale: np.ndarray  # (num_features,)
 
 
 @dataclass(frozen=True)

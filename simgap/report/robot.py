@@ -53,16 +53,15 @@ def own_units(loaded: Loaded | None) -> dict[str, Own]:
 
 @dataclass(frozen=True)
 class Course:
-    """A channel of a log (n,) at times `t` [s], in its column's unit: recorded, simulated by the original
-    model, and by the corrected one; NaN where a simulation restarts."""
+    """A channel of a log (n,) in its column's unit, NaN where a simulation restarts."""
 
     log: str
     channel: str
     unit: str
-    t: np.ndarray
+    t: np.ndarray  # [s]
     recorded: np.ndarray
-    simulated: np.ndarray
-    corrected: np.ndarray
+    simulated: np.ndarray  # by the original model
+    corrected: np.ndarray  # by the corrected one
     over: float  # mean square residual of the original model, in noise variances
 
 

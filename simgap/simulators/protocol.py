@@ -23,8 +23,8 @@ Channels = Mapping[str, np.ndarray]  # channel name -> (num_timesteps,)
 
 @dataclass(frozen=True)
 class Channel:
-    """One column of the logs: `unit`, standard deviation `noise` of one sample, `kind` (one of KINDS). A
-    command is given to the simulator and not compared. NaN noise is estimated from the recording."""
+    """One column of the logs: `unit`, standard deviation `noise` of one sample (NaN: estimated from the
+    recording), `kind` (one of KINDS). A command is given to the simulator and not compared."""
 
     unit: str
     kind: str

@@ -21,14 +21,13 @@ from hmmseg.io.units import Column
 
 @dataclass(frozen=True)
 class Recording:
-    """Times `t` (num_timesteps,) [s] and `columns` by name, from row `first` of a whole log. NaN is a missing
-    sample. `recording["q1"]` is a column; `warnings` tell what was left out of its file."""
+    """A log, or a window of one; NaN is a missing sample, and `recording["q1"]` a column."""
 
     name: str
-    t: np.ndarray
-    columns: Mapping[str, np.ndarray]
-    first: int = 0
-    warnings: tuple[str, ...] = ()
+    t: np.ndarray  # (num_timesteps,) [s]
+    columns: Mapping[str, np.ndarray]  # by name
+    first: int = 0  # row of the whole log
+    warnings: tuple[str, ...] = ()  # what was left out of its file
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]

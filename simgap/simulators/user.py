@@ -120,13 +120,12 @@ def _line(error: BaseException, where: str, file: str) -> str:
 
 @dataclass(frozen=True)
 class Checks:
-    """Checked calls of a user's functions. `where` they are named, their `file`, `patience` [s] with a call,
-    and the `channels` that a run must return."""
+    """Checked calls of a user's functions."""
 
-    where: str
+    where: str  # they are named
     file: str
-    patience: float
-    channels: tuple[str, ...]
+    patience: float  # [s] with a call
+    channels: tuple[str, ...]  # that a run must return
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call a function."""

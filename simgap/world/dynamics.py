@@ -54,31 +54,25 @@ EDGE = 1e-3  # numerics: m; length over which a contact fades at the end of a fa
 
 
 class Physics(NamedTuple):
-    """All constants of a scene, a pytree of scalars; effects and gradients act on it.
+    """All constants of a scene, a pytree of scalars; effects and gradients act on it."""
 
-    Per block: `weight` [N], `width`, `height` [m] and `friction` against a pad. Per finger: `pad_normal`,
-    `pad_shear` [N/m]. `pad_time` [s] is damping over stiffness of the foam. Supports (ground and block on
-    block): `support_stiffness` [N/m] along and across, `support_damping` (ratio to critical) and
-    `support_friction`. `tilt` [rad] inclines the ground."""
-
-    weight: Scalars
-    width: Scalars
-    height: Scalars
-    friction: Scalars
-    pad_normal: Scalars
-    pad_shear: Scalars
-    pad_time: Scalar
-    support_stiffness: Scalar
-    support_damping: Scalar
+    weight: Scalars  # [N] per block
+    width: Scalars  # [m]
+    height: Scalars  # [m]
+    friction: Scalars  # against a pad
+    pad_normal: Scalars  # [N/m] per finger
+    pad_shear: Scalars  # [N/m]
+    pad_time: Scalar  # [s] the foam's damping over its stiffness
+    support_stiffness: Scalar  # [N/m] of ground and blocks, along and across
+    support_damping: Scalar  # ratio to critical
     support_friction: Scalar
     gravity: Scalar
-    tilt: Scalar
+    tilt: Scalar  # [rad] of the ground
 
 
 class State(NamedTuple):
-    """Centres and velocities of the blocks (num_blocks each), and the anchors of all contacts. Anchors are
-    the relative tangential positions [m] at which a contact carries no shear: `pads` (2 x num_blocks),
-    `ground` (num_blocks) and `pairs` (one per pair of blocks)."""
+    """Centres and velocities of the blocks, and the anchors of all contacts: the relative tangential
+    positions [m] at which they carry no shear."""
 
     x: Scalars
     y: Scalars
@@ -86,7 +80,7 @@ class State(NamedTuple):
     vy: Scalars
     pads: tuple[Scalars, Scalars]
     ground: Scalars
-    pairs: Scalars
+    pairs: Scalars  # one per pair of blocks
 
 
 class Tips(NamedTuple):
@@ -99,32 +93,29 @@ class Tips(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Forces [N]: `fx`, `fy` exerted by each finger, `block_x`, `block_y` net on each block, `pads` the
-    normal force of each finger on each block, `support` the force from beneath each block."""
+    """Forces [N]."""
 
-    fx: Scalars
-    fy: Scalars
-    block_x: Scalars
-    block_y: Scalars
-    pads: tuple[Scalars, Scalars]
-    support: Scalars
+    fx: Scalars  # exerted by each finger
+    fy: Scalars  # likewise
+    block_x: Scalars  # net on each block
+    block_y: Scalars  # likewise
+    pads: tuple[Scalars, Scalars]  # normal, of each finger on each block
+    support: Scalars  # from beneath each block
 
 
 Values = Any  # a jax Array in compiled code, a NumPy array after it
 
 
 class Record(NamedTuple):
-    """A rollout, one row per control period; F fingers (2), B blocks. Tips: `position`, `velocity`, `force`
-    (T, F, 2) [m, m/s, N], x and y last. Blocks: `blocks` and `block_velocity` (T, B, 2) [m, m/s]. Normal
-    forces `pads` (T, F, B) [N], forces from beneath `support` (T, B) [N]."""
+    """A rollout, one row per control period; F fingers (2), B blocks."""
 
-    position: Values
-    velocity: Values
-    force: Values
-    blocks: Values
-    block_velocity: Values
-    pads: Values
-    support: Values
+    position: Values  # (T, F, 2) [m] of the tips
+    velocity: Values  # (T, F, 2) [m/s]
+    force: Values  # (T, F, 2) [N]
+    blocks: Values  # (T, B, 2) [m]
+    block_velocity: Values  # (T, B, 2) [m/s]
+    pads: Values  # (T, F, B) [N] normal forces
+    support: Values  # (T, B) [N] from beneath
 
 
 def tips_of(row: Array) -> Tips:

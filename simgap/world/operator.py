@@ -99,15 +99,13 @@ class Window:
 
 @dataclass(frozen=True)
 class Plan:
-    """Commanded tips (num_periods, 4): x1, y1, x2, y2 [m], one row per control period. `impedance` of the
-    hand is (mass [kg], stiffness [N/m], damping [N s/m]), `start` the initial centre of every block [m],
-    `duration` [s] of the trial."""
+    """One performance as it is commanded."""
 
-    command: np.ndarray
-    impedance: tuple[float, float, float]
-    start: dict[str, tuple[float, float]]
+    command: np.ndarray  # (num_periods, 4) tips x1, y1, x2, y2 [m], one row per control period
+    impedance: tuple[float, float, float]  # of the hand: mass [kg], stiffness [N/m], damping [N s/m]
+    start: dict[str, tuple[float, float]]  # initial centre of every block [m]
     windows: tuple[Window, ...]
-    duration: float
+    duration: float  # [s] of the trial
 
 
 def minimum_jerk(phase: np.ndarray) -> np.ndarray:

@@ -35,13 +35,12 @@ AGREEMENT = 1.5  # chosen: standard deviations within which a wider window must 
 
 @dataclass(frozen=True)
 class Motion:
-    """Smoothed motion of several axes at times `t` (T,) [s]. `position`, `velocity` (T, axes) [m, m/s], and
-    the position's `sd` (T, axes) [m], inf where a gap in the samples was only interpolated."""
+    """Smoothed motion of several axes."""
 
-    t: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    sd: np.ndarray
+    t: np.ndarray  # (T,) [s]
+    position: np.ndarray  # (T, axes) [m]
+    velocity: np.ndarray  # (T, axes) [m/s]
+    sd: np.ndarray  # (T, axes) [m] of the position, inf where a gap was only interpolated
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (len(times), axes): cubic between samples, at rest beyond them."""
@@ -124,15 +123,13 @@ TO_TIPS = np.linalg.inv(TO_MEAN)
 
 @dataclass(frozen=True)
 class Replay:
-    """Predictions for one recording; T samples, 2 fingers, axes x and y last. `force` (T, 2, 2) [N] is
-    predicted at the samples, `measured` (T, 2, 2) [N] recorded; `motion` is the whole rollout at 1 kHz, at
-    times `t` [s]."""
+    """Predictions for one recording; T samples, 2 fingers, axes x and y last."""
 
     signals: Signals
-    force: np.ndarray
-    measured: np.ndarray
-    t: np.ndarray
-    motion: Record
+    force: np.ndarray  # (T, 2, 2) [N] predicted at the samples
+    measured: np.ndarray  # (T, 2, 2) [N]
+    t: np.ndarray  # [s] of the rollout, at 1 kHz
+    motion: Record  # the whole rollout
 
     @property
     def predicted(self) -> dict[str, np.ndarray]:

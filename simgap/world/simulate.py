@@ -23,17 +23,8 @@ from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.spans import Segmentation, known, spans_table
 from hmmseg.tables import Tabled
-from simgap.world.dynamics import (
-    BUCKET,
-    CONTROL_PERIOD,
-    Impedance,
-    Physics,
-    Record,
-    State,
-    interpolated,
-    perform,
-    resting_state,
-)
+from simgap.world import dynamics
+from simgap.world.dynamics import CONTROL_PERIOD, Physics, Record, State
 from simgap.world.operator import OperatorSettings, Plan, Window, plan
 from simgap.world.properties import UNITS, Blocks, blocks_table
 from simgap.world.virtual_model import Surroundings, physics, substeps_for
@@ -148,7 +139,7 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
         plans = [alter(p, np.random.default_rng([seed, 4])) for p, seed in zip(plans, seeds, strict=True)]
     scenes = [physics(rig, [blocks[name] for name in task.objects], surroundings) for blocks in properties]
     substeps = max(substeps_for(scene, CONTROL_PERIOD) for scene in scenes)
-    length = -(-max(len(p.command) for p in plans) // BUCKET) * BUCKET
+    length = -(-max(len(p.command) for p in plans) // dynamics.BUCKET) * dynamics.BUCKET
     trials = []
     for k in range(0, len(plans), BATCH):
         batch = range(k, min(k + BATCH, len(plans)))
@@ -161,7 +152,7 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
 def _perform_all(task: BlockTask, plans: Sequence[Plan], scenes: Sequence[Physics], length: int,
                  substeps: int) -> list[Record]:  # fmt: skip
     """Records of one batch, padded to 1, SMALL or BATCH trials so that three programs serve all sizes."""
-    hands = [Impedance(*map(jnp.asarray, p.impedance)) for p in plans]
+    hands = [dynamics.Impedance(*map(jnp.asarray, p.impedance)) for p in plans]
     commands = [np.pad(p.command, ((0, length - len(p.command)), (0, 0)), "edge") for p in plans]
     starts = [_start(scene, task, p) for scene, p in zip(scenes, plans, strict=True)]
     rows = list(zip(scenes, hands, commands, starts, strict=True))
@@ -174,14 +165,14 @@ def _perform_all(task: BlockTask, plans: Sequence[Plan], scenes: Sequence[Physic
 
 @partial(jax.jit, static_argnames=("substeps",))
 def _perform_batch(
-    scenes: Physics, hands: Impedance, commands: Array, starts: State, substeps: int
+    scenes: Physics, hands: dynamics.Impedance, commands: Array, starts: State, substeps: int
 ) -> Record:
-    return jax.vmap(partial(perform, substeps=substeps))(scenes, hands, commands, starts)
+    return jax.vmap(partial(dynamics.perform, substeps=substeps))(scenes, hands, commands, starts)
 
 
 def _start(scene: Physics, task: BlockTask, performance: Plan) -> State:
     x, y = zip(*(performance.start[name] for name in task.objects), strict=True)
-    return resting_state(scene, [jnp.asarray(v) for v in x], [jnp.asarray(v) for v in y])
+    return dynamics.resting_state(scene, [jnp.asarray(v) for v in x], [jnp.asarray(v) for v in y])
 
 
 def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks: Blocks,
@@ -192,7 +183,9 @@ def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks:
     fine = np.arange(n) * CONTROL_PERIOD
     rate = rig.rate or DEFAULT_RATE
     t = np.arange(int(round(performance.duration * rate, 6))) / rate
-    place, speed, force = (interpolated(t, fine, z) for z in (motion.position, motion.velocity, motion.force))
+    place, speed, force = (
+        dynamics.interpolated(t, fine, z) for z in (motion.position, motion.velocity, motion.force)
+    )
     trial = record(t, place, speed, force, rig, np.random.default_rng([seed, 2]), f"simulated, seed {seed}")
     order = {name: k for k, name in enumerate(task.objects)}
     truth = [time for w in performance.windows for time in _boundaries(w, order[w.object], fine, motion)]

@@ -43,15 +43,13 @@ RIGID_PAD = 1e5  # numerics: N/m in place of inf: 3 N of grip compress such a pa
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a rig does not state: supports and the foam's damping. Supports are stiff springs [N/m] with
-    damping (ratio to critical for one block) and friction. The foam's damping is given by `pad_time` [s],
-    damping over stiffness, and the ground's slope by `tilt` [rad]."""
+    """What a rig does not state: supports and the foam's damping."""
 
-    support_stiffness: float = 4e5
-    support_damping: float = 0.5
+    support_stiffness: float = 4e5  # [N/m]
+    support_damping: float = 0.5  # ratio to critical for one block
     support_friction: float = 0.5
-    pad_time: float = 2e-3
-    tilt: float = 0.0
+    pad_time: float = 2e-3  # [s] damping over stiffness of the foam
+    tilt: float = 0.0  # [rad] of the ground
 
 
 def physics(rig: Rig, blocks: Sequence[Block], surroundings: Surroundings | None = None) -> Physics:

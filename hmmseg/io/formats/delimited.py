@@ -29,8 +29,7 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of one text file; line numbers count from 0. `most`: cells of the longest row, of which
-    those beyond the names are empty. `notes`: what was dropped."""
+    """The layout of one text file; line numbers count from 0."""
 
     encoding: str
     separator: str
@@ -39,8 +38,8 @@ class Layout:
     units: dict[str, str]
     skipped: frozenset[int]
     rows: np.ndarray
-    most: int
-    notes: tuple[str, ...]
+    most: int  # cells of the longest row; those beyond the names are empty
+    notes: tuple[str, ...]  # what was dropped
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:

@@ -45,15 +45,14 @@ Message = tuple[str, int, Callable[[], Any]]  # topic, when it was logged [ns si
 
 @dataclass
 class Stream:
-    """Messages of one topic while they are read: times [ns since 1970], 0 without a stamp, and flat fields;
-    `failed` counts those that could not be decoded, with the first's `reason`."""
+    """Messages of one topic while they are read."""
 
     topic: str
-    logged: list[int] = field(default_factory=list)
-    stamped: list[int] = field(default_factory=list)
-    values: list[dict[str, float]] = field(default_factory=list)
-    failed: int = 0
-    reason: str = ""
+    logged: list[int] = field(default_factory=list)  # [ns since 1970]
+    stamped: list[int] = field(default_factory=list)  # [ns since 1970], 0 without a stamp
+    values: list[dict[str, float]] = field(default_factory=list)  # flat fields
+    failed: int = 0  # messages that could not be decoded
+    reason: str = ""  # of the first of these
 
     def add(self, logged: int, decode: Callable[[], Any]) -> None:
         """Keep one message, or the reason why it cannot be decoded."""

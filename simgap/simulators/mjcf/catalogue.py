@@ -32,14 +32,7 @@ from simgap.simulators.mjcf.setting import (
     setting_of,
     strength_of,
 )
-from simgap.simulators.mjcf.transmission import (
-    SHARE,
-    Motion,
-    elasticity,
-    motion_of,
-    periods,
-    sizes_of,
-)
+from simgap.simulators.mjcf.transmission import SHARE, Motion, elasticity, motion_of, periods, sizes_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 

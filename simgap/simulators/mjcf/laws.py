@@ -39,14 +39,12 @@ class _Friction:
 
 @dataclass(frozen=True)
 class Laws:
-    """Laws that act in a model.
+    """Laws that act in a model."""
 
-    `friction`: of joints; `fading`: by drive the actuator, the fade over its largest force, the joint's
-    number, and its torque by a unit force; `uneven`: by joint the numbers of coordinate and velocity, the
-    periods per turn, both amplitudes, and whether they multiply the motor's torque."""
-
-    friction: tuple[_Friction, ...]
+    friction: tuple[_Friction, ...]  # of joints
+    # by drive: actuator, fade over its largest force, the joint's number, its torque by a unit force
     fading: tuple[tuple[int, float, int, float], ...]
+    # by joint: coordinate, velocity, periods per turn, both amplitudes, whether of the motor's torque
     uneven: tuple[tuple[int, int, float, float, float, bool], ...]
 
     def __bool__(self) -> bool:

@@ -12,20 +12,11 @@ import numpy as np
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.units import UNITS, known_unit, unwrapped
 from simgap.robot_effects.base import RobotEffect
+from simgap.simulators.mjcf import setting
 from simgap.simulators.mjcf.catalogue import offered
 from simgap.simulators.mjcf.engine import FREE, HINGE, JOINT, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
 from simgap.simulators.mjcf.model import MjcfSimulator, ties
-from simgap.simulators.mjcf.setting import (
-    compiled,
-    follows_rates,
-    name_of,
-    names_of,
-    object_id,
-    only_slides,
-    setting_of,
-    turns,
-)
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
 
@@ -97,28 +88,28 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
             raise InputError(f"{map_file}: {key}", f"the model has no {kind} {name}", nearest(name, known))
 
     for column, m in described.columns.items():
-        check(f"columns.{column}", m.thing, m.name, names_of(plain, m.thing))
+        check(f"columns.{column}", m.thing, m.name, setting.names_of(plain, m.thing))
         if m.thing == "joint" and int(plain.joint(m.name).type.item()) not in (HINGE, SLIDE):
             raise InputError(f"{map_file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
                              "the seven columns of its body's pose")  # fmt: skip
     if described.keyframe is not None:
-        check("keyframe", "keyframe", described.keyframe, names_of(plain, "key"))
+        check("keyframe", "keyframe", described.keyframe, setting.names_of(plain, "key"))
     for name in candidates:
-        setting_of(plain, name)
+        setting.setting_of(plain, name)
     for body, place in described.payload_at.items():
-        check(f"payload_at.{body}", "body", body, names_of(plain, "body"))
+        check(f"payload_at.{body}", "body", body, setting.names_of(plain, "body"))
         if isinstance(place, str):
-            check(f"payload_at.{body}", "site", place, names_of(plain, "site"))
+            check(f"payload_at.{body}", "site", place, setting.names_of(plain, "site"))
     address = _add_sensors(spec, described.columns)
     # Else centres of mass could not be moved in the compiled model. Only of what is simple MuJoCo leaves the
     # rotor out where it reckons how softly ties and friction hold it.
     for body in spec.bodies:
         if hasattr(body, "simple"):
-            body.simple = only_slides(plain, body.id)
+            body.simple = setting.only_slides(plain, body.id)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if not np.any((plain.geom_contype != 0) | (plain.geom_conaffinity != 0)):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # an eighth of a small robot's time
-    model = compiled(spec)
+    model = setting.compiled(spec)
     simulator, warnings = _simulator(model, described, str(map_file), address)
     simulator.spec = spec
     if xml.suffix.lower() == ".urdf" and not model.nu:
@@ -194,20 +185,20 @@ def _simulator(
         _check_unit(f"{file}: columns.{column}.unit", m, unit)
         channels[column] = Channel(unit, m.kind, m.sd)
         if m.kind == "command":
-            driven[column] = object_id(model, "actuator", m.name)
+            driven[column] = setting.object_id(model, "actuator", m.name)
             continue
         sensor, at = address[column]
-        number = object_id(model, "sensor", sensor)
+        number = setting.object_id(model, "sensor", sensor)
         if at >= model.sensor_dim[number]:
             raise InputError(f"{file}: columns.{column}.axis", f"sensor {m.name} has no {m.axis}")
         sensors[column] = int(model.sensor_adr[number]) + at
         if m.thing == "joint" and m.kind == "position":
-            joints[column] = object_id(model, "joint", m.name)
+            joints[column] = setting.object_id(model, "joint", m.name)
         if m.thing == "body":
             poses.setdefault(m.name, {})[m.axis] = column
     free = {}
     for name, pose in poses.items():
-        first = int(model.body_jntadr[object_id(model, "body", name)])
+        first = int(model.body_jntadr[setting.object_id(model, "body", name)])
         if first < 0 or int(model.jnt_type[first]) != FREE:
             continue
         if len(pose) == len(POSE):
@@ -218,13 +209,13 @@ def _simulator(
                             "the model has it")  # fmt: skip
     known = {*joints.values(), *(joint for joint, _, _ in ties(model, [*joints.values()]))}
     moving = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist()
-    if unseen := [name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
+    if unseen := [setting.name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
         warnings.append(
             f"{file}: no column shows {', '.join(unseen)}, which the model moves as it runs freely"
         )
     idle = [i for i in range(model.nu) if i not in driven.values()]
     if idle:
-        names = ", ".join(name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
+        names = ", ".join(setting.name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
         warnings.append(f"{file}: no column drives {names}; they are left at zero or the keyframe")
     touching = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     whole = {name: pose for name, pose in poses.items() if len(pose) == len(POSE)}
@@ -247,7 +238,9 @@ def _unit(model: Any, m: Mapped) -> str:
     if m.thing in ("body", "site"):
         return "1" if m.axis.startswith("q") else "m"
     if m.thing == "actuator":
-        return READ[m.thing, m.kind][1 if turns(model, object_id(model, "actuator", m.name)) else 2]
+        return READ[m.thing, m.kind][
+            1 if setting.turns(model, setting.object_id(model, "actuator", m.name)) else 2
+        ]
     return READ[m.thing, m.kind][1 if _turns(model, m) else 2]
 
 
@@ -286,7 +279,7 @@ def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
     """InputError where a servo's goals are its joint's in other units; units are never guessed."""
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
-        joint, per = int(model.actuator_trnid[a, 0]), "/s" if follows_rates(model, a) else ""
+        joint, per = int(model.actuator_trnid[a, 0]), "/s" if setting.follows_rates(model, a) else ""
         servo = int(model.actuator_trntype[a]) == JOINT and (per or model.actuator_biasprm[a, 1] < 0)
         if not servo or joint not in seen or int(model.jnt_type[joint]) != HINGE:
             continue

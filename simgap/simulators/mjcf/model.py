@@ -29,23 +29,19 @@ GIVEN = 1000  # numerics: windows for which it is kept how far ties give in the 
 @dataclass
 class MjcfSimulator:
     """A compiled model with a sensor for each compared column. What no column determines starts as the
-    model's own run of the whole log has it.
-
-    `sensor`: address in the sensor data by compared column; `joints`: joint by position column; `driven`:
-    actuator by command column; `free`: columns of the pose by free joint; `poses`: columns of every body
-    whose whole pose is read; `played`: models with play in a joint, by setting; `spec`: what the model was
-    compiled from."""
+    model's own run of the whole log has it."""
 
     model: Any
     map: Map
     channels: Mapping[str, Channel]
     parameters: Mapping[str, Parameter]
     settings: Mapping[str, Setting]
-    sensor: Mapping[str, int]
-    joints: Mapping[str, int]
-    driven: Mapping[str, int]
-    free: Mapping[int, Mapping[str, str]]
+    sensor: Mapping[str, int]  # address in the sensor data by compared column
+    joints: Mapping[str, int]  # joint by position column
+    driven: Mapping[str, int]  # actuator by command column
+    free: Mapping[int, Mapping[str, str]]  # columns of the pose by free joint
     touching: bool
+    # columns of every body whose whole pose is read
     poses: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     says: Mapping[str, str] = field(default_factory=dict)
     played: Mapping[str, Played] = field(default_factory=dict)  # by setting

@@ -28,17 +28,16 @@ LIGHT = 1e-6  # numerics: kg, kg m^2: the motor's body; its rotor is its joint's
 
 @dataclass
 class Played:
-    """A model in which one joint has play. `joint`: its number in the plain model; `logs`: by name; `width`:
-    the setting of the play; `seen`: joint by position column."""
+    """A model in which one joint has play."""
 
     model: Any
     runs: Runs
     settings: Mapping[str, Setting]
     name: str
-    joint: int
-    logs: Mapping[str, Recording]
-    width: str
-    seen: Mapping[str, int]
+    joint: int  # its number in the plain model
+    logs: Mapping[str, Recording]  # by name
+    width: str  # the setting of the play
+    seen: Mapping[str, int]  # joint by position column
     known: dict = field(default_factory=dict, repr=False)
 
     def __call__(

@@ -27,18 +27,15 @@ HELD = ("hold", "smooth", "late")
 
 @dataclass(frozen=True)
 class Setting:
-    """One quantity that can be set: its `nominal` value, and `put(model, value)`, which sets it.
-
-    `derived`: whether constants derived from it (mj_setConst) must be recomputed; `stored`: whether MuJoCo
-    writes it to XML; `mixed`: of what comes in whole steps only, the value whose run is interpolated with the
-    nominal one."""
+    """One quantity that can be set."""
 
     name: str
     unit: str
     nominal: float
-    put: Put
-    derived: bool = False
-    stored: bool = True
+    put: Put  # sets a value in a model
+    derived: bool = False  # whether constants derived from it (mj_setConst) must be recomputed
+    stored: bool = True  # whether MuJoCo writes it to XML
+    # of what comes in whole steps, the value whose run is interpolated with the nominal one
     mixed: float | None = None
 
 

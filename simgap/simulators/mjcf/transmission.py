@@ -131,16 +131,15 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
 
 @dataclass(frozen=True)
 class Motion:
-    """Times (n,) [s] of a log's samples, and the rows of which torques are computed, 100 a second at most. By
-    joint: position, rate, acceleration, the torque that they take, and what motors give."""
+    """The motion along a log, by joint."""
 
-    t: np.ndarray
-    rows: np.ndarray
+    t: np.ndarray  # (n,) [s] of its samples
+    rows: np.ndarray  # of which torques are computed, 100 a second at most
     position: dict[int, np.ndarray]
     rate: dict[int, np.ndarray]
     acceleration: dict[int, np.ndarray]
-    torque: dict[int, np.ndarray]
-    motor: dict[int, np.ndarray]
+    torque: dict[int, np.ndarray]  # that it takes
+    motor: dict[int, np.ndarray]  # that motors give
 
 
 def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
