@@ -242,9 +242,7 @@ def _rigidity(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterat
 
 def _motion(aligned: AlignedTrials) -> Iterator[Tie]:
     """Displacements equal integrated velocities."""
-    slopes = [
-        [scale_to_velocity(one.trial, *pair) for pair in position_pairs(one.trial)] for one in aligned.trials
-    ]
+    slopes = [[scale_to_velocity(a.trial, *pair) for pair in position_pairs(a.trial)] for a in aligned.trials]
     ratios = np.array(slopes).ravel()
     usable = ratios[np.isfinite(ratios) & (ratios > 0)]
     if usable.size < 2 or usable.size <= ratios.size / 2:
@@ -318,9 +316,7 @@ def _support(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterato
                 if (other := grips.get(there)) is not None:  # where it stands meanwhile
                     miss = max(other.x1 - grip.x2, grip.x1 - other.x2)
                     off.setdefault((grip.object, below), []).append(miss)
-    pair, miss = max(
-        ((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0.0)
-    )
+    pair, miss = max(((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0))
     if miss > 0:
         text = f"{pair[0]} stands {1e3 * miss:.2g} mm beside {pair[1]}, on which the task has it"
         yield Tie("support", miss, 0.0, ("height",), text)

@@ -39,9 +39,7 @@ Terms = dict[str, int]
 def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[Terms]:
     """Independent integer combinations of the unknowns in `order` that span `rows`, coprime, single ones
     first."""
-    given = [
-        _whole({k: Fraction(v) for k, v in row.items() if v}, order) for row in rows if any(row.values())
-    ]
+    given = [_whole({k: Fraction(v) for k, v in r.items() if v}, order) for r in rows if any(r.values())]
     echelon = [_whole(row, order) for row in _echelon(given, order)]
     single = [row for row in echelon if len(row) == 1]
     known = {name for row in single for name in row}
@@ -199,9 +197,8 @@ def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None)
             law = getattr(signals, f"f{name}")
             if usual is not None:
                 law = law * np.log(np.maximum(np.abs(law), 1e-3 * usual) / usual)
-            moved[name] = (
-                getattr(signals, name) - law * getattr(pads.unit_pads(rig), f"{kind}{finger}") * size
-            )
+            compliance = getattr(pads.unit_pads(rig), f"{kind}{finger}")
+            moved[name] = getattr(signals, name) - law * compliance * size
         return replace(signals, **moved)
 
     return read
@@ -330,9 +327,7 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
     gives = []
     for a in weighed:
-        squeeze, shear = (
-            np.nan_to_num(give(a.signals, rig)) for give in (pads.squeeze_give, pads.shear_give)
-        )
+        squeeze, shear = (np.nan_to_num(of(a.signals, rig)) for of in (pads.squeeze_give, pads.shear_give))
         gives.append([(np.mean(w["distance"] @ squeeze), *(np.mean(w[k] @ shear) for k in
                       ("pickup", "force", "place"))) for w in a.grips.values()])  # fmt: skip
     grip, picked, carried, placed = np.moveaxis(np.array(gives), -1, 0)
@@ -359,9 +354,7 @@ def free_means(
 def _zeros(a: WeighedTrial, free_steps: Sequence[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean times (N,) of halves of free stretches of a trial, mean forces (N, 4) there, and their errors."""
     spans = [np.flatnonzero((a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0)) for k in free_steps]
-    halves = [
-        half for span in spans for half in np.array_split(span, 2) if half.size >= observations.MIN_FREE
-    ]
+    halves = [h for span in spans for h in np.array_split(span, 2) if h.size >= observations.MIN_FREE]
     if not halves:
         return np.zeros(1), np.zeros((1, 4)), np.ones((1, 4))
     each = [np.stack([getattr(a.signals, name)[half] for name in FORCE_CHANNELS]) for half in halves]
@@ -485,9 +478,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in weighed])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
     slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # channels that determine no unknown
-    slope_variance, alike = (
-        np.stack(each) for each in zip(*(slope_variances(a, moves) for a in weighed), strict=True)
-    )
+    slope_variance, alike = map(np.stack, zip(*(slope_variances(a, moves) for a in weighed), strict=True))
     doubts = pad_doubts(slopes, slope_variance, alike, weighed, rig)
     slope_sd = np.array([SLOPE_SD, *(doubt.slope_sd for doubt in doubts.values())])
     slope_variance += slope_sd[sloped] ** 2

@@ -277,8 +277,6 @@ def _not_recorded(aligned: AlignedTrials, obj: str, needed: list[str]) -> str:
     if not needed:
         return f"no subtask of this task lifts {obj}"
     missing = f"the recording does not show {' and '.join(needed)} as the task has it"
-    faults = [
-        f"{t.trial.file}: {fault.line}" for t in aligned.trials for fault in t.trial.faults if fault.spans
-    ]
+    faults = [f"{t.trial.file}: {f.line}" for t in aligned.trials for f in t.trial.faults if f.spans]
     more = f" and {len(faults) - LISTED} more" if len(faults) > LISTED else ""
     return missing + (f" ({'; '.join(faults[:LISTED])}{more})" if faults else "")

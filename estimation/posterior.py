@@ -63,9 +63,7 @@ def normal_equations(theta: Any, model: Model, xp: ModuleType = np) -> tuple[Any
     precision = (weight @ model.products)[:, np.maximum(place, place.T)]
     precision = precision + model.precision[None] + prior[:, :, None] * np.eye(size)[None]
     gradient = (weight * model.residual[None]) @ model.matrix + model.gradient[None]
-    rest = xp.sum(xp.log(weight) - weight * model.residual[None] ** 2, axis=1) - xp.sum(
-        xp.log(common), axis=1
-    )
+    rest = xp.sum(xp.log(weight) - weight * model.residual[None] ** 2, 1) - xp.sum(xp.log(common), 1)
     return precision, gradient, rest / 2
 
 
@@ -155,9 +153,8 @@ class Posterior:
 def posterior(design: Design) -> Posterior:
     """The posterior of a design that determines at least one unknown."""
     sd = np.sqrt(design.variance)
-    return Posterior(
-        design, np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)[0]
-    )
+    q = np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)[0]
+    return Posterior(design, q)
 
 
 def independent(design: Design) -> tuple[Design, np.ndarray]:

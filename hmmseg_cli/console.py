@@ -28,6 +28,7 @@ import hmmseg
 from hmmseg.cache import CacheWarning
 from hmmseg.errors import InputError
 from hmmseg.io.formats import KINDS, kind_of, parts_of, split_part
+from hmmseg.io.schema import read_toml
 
 STANDARD_OUTPUT = "-"
 INPUT_SUFFIXES = (*KINDS, ".toml")
@@ -242,9 +243,8 @@ def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> 
         found[1] = rig  # needs no hand, and a rig in its folder may be another task's
     if as_task and not as_task & TASK_KEYS and (task is not None or as_rig & TASK_KEYS):
         swapped = f"; are --task and --rig {found[1]} swapped?" if as_rig & TASK_KEYS else ""
-        raise InputError(
-            f"--task {found[0]}", "describes no task", f"objects and moves, or a sequence{swapped}"
-        )
+        expected = f"objects and moves, or a sequence{swapped}"
+        raise InputError(f"--task {found[0]}", "describes no task", expected)
     if as_rig & TASK_KEYS:
         raise InputError(f"--rig {found[1]}", "describes a task", "the description of a hand")
     return found[0], found[1]
@@ -253,17 +253,13 @@ def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> 
 def require_rig(rig: Path | None, trials: Sequence[Path]) -> Path:
     """The rig of a task of blocks; InputError if there is none."""
     if rig is None:
-        folder = split_part(trials[0])[0].parent
-        raise InputError(
-            "--rig", "missing", f"the nominal hand of a task of blocks, or a rig.toml in {folder}"
-        )
+        expected = f"the nominal hand of a task of blocks, or a rig.toml in {split_part(trials[0])[0].parent}"
+        raise InputError("--rig", "missing", expected)
     return rig
 
 
 def _keys(path: Path | None) -> set[str]:
     """Top-level keys of a TOML file; none if it cannot be read, which its reader reports."""
-    from hmmseg.io.schema import read_toml
-
     try:
         return set() if path is None else set(read_toml(path))
     except InputError:
@@ -276,9 +272,8 @@ def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any =
 
     found = [read_trial(path, rig, task) for path in paths]
     if rig is not None and rig.effects and out.command != "simulate":
-        out.warn(
-            f"rig.toml's [effects] ({', '.join(rig.effects)}) act in simulate alone; they are left out here"
-        )
+        names = ", ".join(rig.effects)
+        out.warn(f"rig.toml's [effects] ({names}) act in simulate alone; they are left out here")
     for trial in found:
         out.warn(*trial.warnings)
         out.print(*trial.notes)

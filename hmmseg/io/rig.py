@@ -8,16 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from hmmseg.errors import nearest
-from hmmseg.io.schema import (
-    LARGEST,
-    Deviation,
-    Finite,
-    FinitePositive,
-    Name,
-    Positive,
-    StrictTable,
-    read_toml,
-)
+from hmmseg.io.schema import LARGEST, Deviation, Finite, FinitePositive, Name, Positive, StrictTable
 from hmmseg.io.units import Columns
 
 Link = Annotated[FinitePositive, Field(le=10)]  # limit: m; longer ones are in mm or cm
@@ -254,4 +245,4 @@ def parse_rig(table: dict[str, Any], where: str = "rig") -> Rig:
 
 def read_rig(path: str | Path) -> Rig:
     """Rig from a `rig.toml` file; InputError for anything at fault."""
-    return parse_rig(read_toml(path), str(path))
+    return Rig.from_toml(path)

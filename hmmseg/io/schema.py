@@ -54,6 +54,11 @@ class StrictTable(BaseModel):
             problem += f" (found {found if len(found) < 100 else found[:100] + '...'})"
         raise InputError(f"{where}: key {key}" if key else where, problem)
 
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """The same from a TOML file; InputError as well if it cannot be read."""
+        return cls.validated(read_toml(path), str(path))
+
 
 def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:
     """Keys of the table that contains the last, unknown part of `location`."""

@@ -34,10 +34,8 @@ def stacked_panels(
     axes[-1].set_xlabel("Time [s]")
     axes[-1].set_xlim(t[0], t[-1])
     name_spans(axes[0], segmentation)
-    if segmentation.failed is not None:
-        figure.suptitle(
-            f"does not fit its task at {segmentation.failed.label}", fontsize=8, fontweight="bold"
-        )
+    if (failed := segmentation.failed) is not None:
+        figure.suptitle(f"does not fit its task at {failed.label}", fontsize=8, fontweight="bold")
     colours = state_colours([span.state for span in segmentation.spans])
     handles = [Patch(color=colour, alpha=0.32, lw=0, label=state) for state, colour in colours.items()]
     handles.append(Patch(facecolor=INK, alpha=0.28, lw=0, label="boundary, 90 % interval"))

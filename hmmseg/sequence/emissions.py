@@ -172,9 +172,7 @@ def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
     skipped."""
     total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
     stay, *jumps = chain.bands
-    advance, *skips = (
-        band + total[:, d:] - total[:, : total.shape[1] - d] for d, band in enumerate(jumps, 1)
-    )
+    advance, *skips = (band + total[:, d:] - total[:, :-d] for d, band in enumerate(jumps, 1))
     ends = {"log_initial": chain.log_initial, "log_final": chain.log_final}
     return Chain(stay, advance, skips or None, **ends)
 
@@ -209,9 +207,7 @@ class Learner:
     def align(self, emissions: StudentEmissions, law: Chain,
               detectors: Detectors | None = None) -> list[AlignmentPosterior]:  # fmt: skip
         """Posterior alignments of all trials, within what labels allow."""
-        tables, chains = zip(
-            *(weigh(values, emissions, law, detectors) for values in self.values), strict=True
-        )
+        tables, chains = zip(*(weigh(v, emissions, law, detectors) for v in self.values), strict=True)
         tables = [ll if free is None else ll + free for ll, free in zip(tables, self.allowed, strict=True)]
         return align(tables, chains)
 

@@ -168,9 +168,8 @@ def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     except (TypeError, ValueError):
         raise InputError(where, f"found {given!r}", "a list of times in s") from None
     if boundaries.shape != (len(names),):
-        raise InputError(
-            where, f"has {boundaries.size} boundaries", f"{len(names)} for {len(names) + 1} subtasks"
-        )
+        expected = f"{len(names)} for {len(names) + 1} subtasks"
+        raise InputError(where, f"has {boundaries.size} boundaries", expected)
     if not np.isfinite(boundaries[~unknown]).all():
         raise InputError(where, "has a boundary that is no number", "times in s")
     at = np.flatnonzero(~unknown)

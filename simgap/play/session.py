@@ -28,9 +28,8 @@ LONGEST = 600.0  # limit: s of a recording
 def default_rig() -> Rig:
     """Fingertips on foam pads as in the included recordings, recorded without joints."""
     pads = {"normal_stiffness": 4000.0, "shear_stiffness": 2500.0}
-    return Rig.read(
-        {"rate": RATE, "fingertip": pads, "noise": {"position": 2e-5, "velocity": 3e-3, "force": 0.01}}
-    )
+    noise = {"position": 2e-5, "velocity": 3e-3, "force": 0.01}
+    return Rig.read({"rate": RATE, "fingertip": pads, "noise": noise})
 
 
 def default_task(objects: list[str]) -> BlockTask:
@@ -104,9 +103,7 @@ class Session:
                 world.advance(self.command, self.rate)
             if self.nominal.t < LONGEST:
                 tips = self.nominal
-                self._rows.append(
-                    np.concatenate([tips.position.ravel(), tips.velocity.ravel(), tips.force.ravel()])
-                )
+                self._rows.append(np.concatenate([tips.position, tips.velocity, tips.force], axis=None))
 
     def _follow(self) -> None:
         """Let the command follow the mouse as a hand would: smoothly, with limited speed."""

@@ -77,9 +77,8 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
             if share is not None and entry["probability"] >= 0.01:
                 ends = entry.get("interval_90") or (share, share)
                 axes.plot(ends, [k, k], color=RED, lw=1.4)
-                axes.plot(
-                    share, k, "o", color=RED, ms=4, label="share of the gap" if k == len(rows) - 1 else None
-                )
+                label = "share of the gap" if k == len(rows) - 1 else None
+                axes.plot(share, k, "o", color=RED, ms=4, label=label)
         axes.set_yticks(at, [plain_name(name) for name, _ in rows])
         axes.set(xlim=(0, 1.02))
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
@@ -240,11 +239,9 @@ def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
     at = np.arange(len(logs))
     with canvas(path, height=2.6) as figure:
         axes = figure.add_subplot()
-        for place, residual, colour, name in zip(
-            (-0.2, 0.2), both, (RED, BLUE), ("before", "after"), strict=True
-        ):
-            each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
-            axes.bar(at + place, each, 0.4, color=colour, label=name)
+        for place, left, colour, how in zip((-0.2, 0.2), both, (RED, BLUE), ("before", "after"), strict=True):
+            each = [np.sqrt(np.nanmean(((left / size)[rows.log == k]) ** 2)) for k in at]
+            axes.bar(at + place, each, 0.4, color=colour, label=how)
         axes.axhline(1, color=GREY, lw=0.8, ls="--")
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")

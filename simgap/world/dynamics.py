@@ -342,9 +342,7 @@ def _damping(physics: Physics, weight: Scalar) -> Scalar:
 # from commanding positions beyond the contact.
 
 CONTROL_PERIOD = 1e-3  # numerics: s; between commands, and between records
-BUCKET = (
-    4000  # numerics: control periods; commands are padded to multiples of it, so few programs are compiled
-)
+BUCKET = 4000  # numerics: control periods; commands are padded to its multiples, so few programs are compiled
 
 
 class Impedance(NamedTuple):

@@ -233,14 +233,12 @@ def plan(task: BlockTask, rig: Rig, blocks: Blocks, settings: OperatorSettings,
     offset, tremor, wander = (performer.draw(name) for name in ("offset", "tremor", "wander"))
     tips = np.stack([x - gap / 2, y - offset / 2, x + gap / 2, y + offset / 2], 1)
     for k in range(4):
-        tips[:, k] += _oscillation(t, TREMOR_BAND, tremor, rng) + _oscillation(t, WANDER_BAND, wander, rng)
+        tips[:, k] += _sway(t, TREMOR_BAND, tremor, rng) + _sway(t, WANDER_BAND, wander, rng)
     damping = 2 * performer.draw("hand_damping") * np.sqrt(performer.stiffness * performer.mass)
     return Plan(tips, (performer.mass, performer.stiffness, damping), start, windows, duration)
 
 
-def _oscillation(
-    t: np.ndarray, band: tuple[float, float], rms: float, rng: np.random.Generator
-) -> np.ndarray:
+def _sway(t: np.ndarray, band: tuple[float, float], rms: float, rng: np.random.Generator) -> np.ndarray:
     """Narrow-band motion [m] (T,) of a given rms: sinusoids of random frequency and phase."""
     count = 6
     frequency, phase = rng.uniform(*band, (count, 1)), rng.uniform(0, 2 * np.pi, (count, 1))

@@ -68,9 +68,7 @@ def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
             raise InputError(f"{path}: key properties", "missing", "the JSON of identify")
     else:
         measured = read_actual(path, task.objects)
-        table = {
-            name: {key: value for key, (value, _) in entries.items()} for name, entries in measured.items()
-        }
+        table = {name: {key: v for key, (v, _) in entries.items()} for name, entries in measured.items()}
     return blocks_of(table, task, str(path))
 
 

@@ -176,10 +176,8 @@ def finger_motion(signals: Signals) -> Motion:
     s, scale = signals, np.sqrt([1.0, 1.0, 4.0, 4.0])  # sd_* are those of a mean; differences have twice them
     position = np.stack([s.x, s.y, s.distance, s.offset], 1)
     velocity = np.stack([s.vx, s.vy, s.vx2 - s.vx1, s.vy2 - s.vy1], 1)
-    sd_position, sd_velocity = (
-        np.stack(sds * 2, 1) * scale for sds in ([s.sd_x, s.sd_y], [s.sd_vx, s.sd_vy])
-    )
-    return smooth(s.t, position, velocity, sd_position, sd_velocity)
+    sd_position, sd_rate = (np.stack(sds * 2, 1) * scale for sds in ([s.sd_x, s.sd_y], [s.sd_vx, s.sd_vy]))
+    return smooth(s.t, position, velocity, sd_position, sd_rate)
 
 
 def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarray) -> dict[str, float]:

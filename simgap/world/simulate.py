@@ -183,9 +183,8 @@ def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks:
     fine = np.arange(n) * CONTROL_PERIOD
     rate = rig.rate or DEFAULT_RATE
     t = np.arange(int(round(performance.duration * rate, 6))) / rate
-    place, speed, force = (
-        dynamics.interpolated(t, fine, z) for z in (motion.position, motion.velocity, motion.force)
-    )
+    moved = motion.position, motion.velocity, motion.force
+    place, speed, force = (dynamics.interpolated(t, fine, z) for z in moved)
     trial = record(t, place, speed, force, rig, np.random.default_rng([seed, 2]), f"simulated, seed {seed}")
     order = {name: k for k, name in enumerate(task.objects)}
     truth = [time for w in performance.windows for time in _boundaries(w, order[w.object], fine, motion)]

@@ -196,9 +196,8 @@ def _program(num_blocks: int, substeps: int) -> Callable:
     block = [Block(1.0, 1.0, 1.0)] * num_blocks
     template = physics(Rig(), block)
     _, constants_of = ravel_pytree(template)
-    _, state_of = ravel_pytree(
-        resting_state(template, [jnp.zeros(())] * num_blocks, [jnp.zeros(())] * num_blocks)
-    )
+    nowhere = [jnp.zeros(())] * num_blocks
+    _, state_of = ravel_pytree(resting_state(template, nowhere, nowhere))
 
     def program(constants: Array, flat: Array, before: Array, after: Array, dt: Array) -> tuple[Array, Array]:
         scene, tips = constants_of(constants), tips_of(after)

@@ -213,9 +213,7 @@ def _bag_messages(file: BufferedIOBase, path: Path, notes: list[str]) -> Iterato
     for head, data in _records(file):
         kind = head[b"op"]
         if kind == b"\x03" and head.get(b"index_pos") == bytes(8):
-            notes.append(
-                f"{path}: has no index: the recording was not finished; it is read as far as it goes"
-            )
+            notes += [f"{path}: has no index: the recording was not finished; it is read as far as it goes"]
         inside = [(head, data)] if kind != b"\x05" else _records(_decompress(head, data))
         for inner, content in inside:
             if inner[b"op"] == b"\x07":

@@ -165,9 +165,7 @@ class _Catalogue:
                     self._add_mass(tool)
                 self._add_payload(name if name in self.simulator.map.payload_at else name_of(m, "body", tool))
             first = int(m.body_jntadr[b])
-            chained = (
-                m.body_jntnum[b] and int(m.jnt_type[first]) in (HINGE, SLIDE) and m.body_parentid[b] != 0
-            )
+            chained = m.body_jntnum[b] and int(m.jnt_type[first]) in (HINGE, SLIDE) and m.body_parentid[b]
             if chained and np.linalg.norm(m.body_pos[b]) > 1e-6:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
 
@@ -281,9 +279,7 @@ def _touching(simulator: MjcfSimulator, recordings: Sequence[Recording]) -> list
     """The geoms that touch most along the recorded motion, those of moving bodies first."""
     if not simulator.touching:
         return []
-    count = Counter(
-        g for log in recordings for pairs in simulator.touched(log) for pair in pairs for g in pair
-    )
+        count = Counter(g for log in recordings for pairs in simulator.touched(log) for p in pairs for g in p)
     moving = {int(simulator.model.jnt_bodyid[j]) for j in (*simulator.free, *simulator.joints.values())}
     ranked = sorted(count, key=lambda g: (int(simulator.model.geom_bodyid[g]) not in moving, -count[g]))
     return ranked[:GEOMS]

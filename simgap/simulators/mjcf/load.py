@@ -15,7 +15,7 @@ from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf import setting
 from simgap.simulators.mjcf.catalogue import offered
 from simgap.simulators.mjcf.engine import FREE, HINGE, JOINT, SLIDE, mujoco
-from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
+from simgap.simulators.mjcf.map import POSE, Map, Mapped
 from simgap.simulators.mjcf.model import MjcfSimulator, ties
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
@@ -44,9 +44,7 @@ class Loaded:
         for name, mapped in columns.items():
             if mapped.kind == "command":  # a drive holds it until the next
                 values[name] = held(values[name])
-            elif (
-                mapped.thing == "joint" and mapped.kind == "position" and _turns(self.simulator.model, mapped)
-            ):
+            elif mapped.kind == "position" and _turns(self.simulator.model, mapped):
                 wrapped, values[name] = values[name], unwrapped(values[name])
                 if not np.array_equal(wrapped, values[name], equal_nan=True):
                     warnings.append(f"{path}: column {name} jumps by whole turns, which were taken out")
@@ -70,7 +68,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
         raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
     if xml.suffix.lower() == ".mjb":
         raise InputError(f"--mjcf {xml}", "is compiled: no sensor can be added", "its MJCF or URDF file")
-    described = read_map(map_file)
+    described = Map.from_toml(map_file)
     try:
         spec = mujoco.MjSpec.from_file(str(xml))
         plain = spec.compile()
@@ -130,9 +128,8 @@ def _add_motors(spec: Any, columns: Mapping[str, Mapped], file: str) -> None:
             raise InputError(where, f"the model has no actuator to give a {m.kind}", motor)
         if spec.joint(m.name) is None:
             known = [joint.name for joint in spec.joints]
-            raise InputError(
-                where, f"the model has no actuator, and no joint {m.name}", nearest(m.name, known)
-            )
+            problem = f"the model has no actuator, and no joint {m.name}"
+            raise InputError(where, problem, nearest(m.name, known))
         if UNITS.get(known_unit(str(m.unit)) or "", ("",))[0] not in ("torque", "force"):
             servo = f'an MJCF with <position joint="{m.name}" kp=".." kv=".."/>, or a torque: {motor}'
             raise InputError(where, "the model has no servo to be commanded", servo)
@@ -210,9 +207,8 @@ def _simulator(
     known = {*joints.values(), *(joint for joint, _, _ in ties(model, [*joints.values()]))}
     moving = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist()
     if unseen := [setting.name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
-        warnings.append(
-            f"{file}: no column shows {', '.join(unseen)}, which the model moves as it runs freely"
-        )
+        names = ", ".join(unseen)
+        warnings.append(f"{file}: no column shows {names}, which the model moves as it runs freely")
     idle = [i for i in range(model.nu) if i not in driven.values()]
     if idle:
         names = ", ".join(setting.name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
@@ -237,11 +233,10 @@ def _unit(model: Any, m: Mapped) -> str:
         return next(name for name, (of, size) in UNITS.items() if of == what and size == 1.0)
     if m.thing in ("body", "site"):
         return "1" if m.axis.startswith("q") else "m"
+    turning = _turns(model, m)
     if m.thing == "actuator":
-        return READ[m.thing, m.kind][
-            1 if setting.turns(model, setting.object_id(model, "actuator", m.name)) else 2
-        ]
-    return READ[m.thing, m.kind][1 if _turns(model, m) else 2]
+        turning = setting.turns(model, setting.object_id(model, "actuator", m.name))
+    return READ[m.thing, m.kind][1 if turning else 2]
 
 
 def _check_unit(where: str, m: Mapped, si: str) -> None:

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, Field, WrapValidator, field_validator, model_validator
 
 from hmmseg.errors import InputError
-from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable, read_toml
+from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable
 from hmmseg.io.units import Quantity
 from simgap.simulators.user import LONGEST
 
@@ -135,11 +135,6 @@ class Map(StrictTable):
                 found = f"{known[of]} and {column} are both the {m.kind} of {m.thing} {m.name}"
                 raise ValueError(f"{found}; expected one column of it (a second encoder is a sensor)")
         return columns
-
-
-def read_map(path: Path) -> Map:
-    """Read a map from a TOML file; InputError names the key at fault."""
-    return Map.validated(read_toml(path), str(path))
 
 
 SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}

@@ -312,17 +312,15 @@ def setting_of(model: Any, name: str) -> Setting:
     head, dot, attribute = name.rpartition(".")
     kind, colon, thing = head.partition(":")
     if not dot or kind not in KINDS or bool(colon) == (kind in ("option", "drive")):
-        raise InputError(
-            where, "names nothing of the model", "KIND:NAME.ATTRIBUTE, such as joint:elbow.damping"
-        )
+        expected = "KIND:NAME.ATTRIBUTE, such as joint:elbow.damping"
+        raise InputError(where, "names nothing of the model", expected)
     if colon and thing not in (known := names_of(model, kind)):
         raise InputError(where, f"the model has no {kind} {thing}", nearest(thing, known))
     make, attributes = KINDS[kind]
     found = make(model, thing, attribute)
     if found is None:
-        raise InputError(
-            where, f"{kind} has no {attribute} that can be a candidate", nearest(attribute, attributes)
-        )
+        problem = f"{kind} has no {attribute} that can be a candidate"
+        raise InputError(where, problem, nearest(attribute, attributes))
     return found
 
 
