@@ -279,7 +279,7 @@ def _touching(simulator: MjcfSimulator, recordings: Sequence[Recording]) -> list
     """The geoms that touch most along the recorded motion, those of moving bodies first."""
     if not simulator.touching:
         return []
-        count = Counter(g for log in recordings for pairs in simulator.touched(log) for p in pairs for g in p)
+    count = Counter(g for log in recordings for pairs in simulator.touched(log) for p in pairs for g in p)
     moving = {int(simulator.model.jnt_bodyid[j]) for j in (*simulator.free, *simulator.joints.values())}
     ranked = sorted(count, key=lambda g: (int(simulator.model.geom_bodyid[g]) not in moving, -count[g]))
     return ranked[:GEOMS]
