@@ -120,7 +120,12 @@ def slip_evidence(
     stretches = [s for s in stretches if s.t.size > 2]
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)
-    every = _rescaled([*stretches, *(s for s in others if s.t.size > 2)])
+    every = [*stretches, *(s for s in others if s.t.size > 2)]
+    if bends := [np.diff(s.anchor, 2) / s.sd[1:-1] for s in every if s.t.size > 3]:
+        shown = robust_sd(np.concatenate(bends)) / np.sqrt(
+            6.0
+        )  # more than the stated noise of anchors, maybe
+        every = [replace(s, sd=s.sd * max(shown, 1.0)) for s in every]
     own = every[: len(stretches)]
     stray = np.array([_log_density(s, STRAY_DRIFT) for s in every]) + np.log(STRAY)
     still = np.array([[_log_density(s, drift) for s in every] for drift in DRIFTS]) + np.log(1 - STRAY)
@@ -139,15 +144,6 @@ def slip_evidence(
     odds = factor + np.log(PRIOR / (1 - PRIOR))
     probability = float(1 / (1 + np.exp(-np.clip(odds, -700, 700))))
     return SlipEvidence(probability, factor, probability > CERTAIN)
-
-
-def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
-    """Raise anchor noise to the level shown by second differences, if the stated noise is too small."""
-    bends = [np.diff(s.anchor, 2) / s.sd[1:-1] for s in stretches if s.t.size > 3]
-    if not bends:
-        return stretches
-    shown = robust_sd(np.concatenate(bends)) / np.sqrt(6.0)
-    return [replace(s, sd=s.sd * max(shown, 1.0)) for s in stretches]
 
 
 def _near(s: Stretch, coefficient: float) -> np.ndarray:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from hmmseg.contact.decompose import decompose as decompose_task
+from hmmseg.io.task import read_task
 from hmmseg.tables import listed
 from hmmseg_cli import options as opt
 from hmmseg_cli.console import Output
@@ -17,9 +19,6 @@ def decompose(
     task: opt.TaskArgument, json: opt.Json = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False
 ) -> None:
     """Subtasks, contact states, and the properties and signals each can reveal."""
-    from hmmseg.contact.decompose import decompose as decompose_task
-    from hmmseg.io.task import read_task
-
     with Output("decompose", json=json, seed=seed, quiet=quiet) as out:
         found = decompose_task(read_task(task))
         out.print(*in_words(found), *found.tables(), found.equation())

@@ -11,6 +11,7 @@ from typing import Any
 from rich.table import Table
 
 import hmmseg
+from hmmseg.cache import cache_folder
 from hmmseg_cli import options as opt
 from hmmseg_cli.console import Output
 
@@ -30,8 +31,6 @@ def doctor(json: opt.Json = None, quiet: opt.Quiet = False) -> None:
 def examined() -> dict[str, Any]:
     """Contents of a bug report, by name; None for what is not installed."""
     import jax
-
-    from hmmseg.cache import cache_folder
 
     folder = cache_folder()
     programs = os.environ.get("JAX_COMPILATION_CACHE_DIR") or (folder and folder / "programs")

@@ -8,18 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hmmseg.errors import InputError
-from hmmseg.io.rig import read_rig
+from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, SequenceTask, read_task
-from hmmseg.segmentation.spans import most_telling, spans_table, trials_table
+from hmmseg.segmentation.spans import Segmentation, most_telling, spans_table, trials_table
 from hmmseg_cli import options as opt
 from hmmseg_cli.batch import recordings_in, segment_apart
 from hmmseg_cli.console import Output, distinct_trials, find_inputs, read_trials, require_rig
 from hmmseg_cli.options import Segmenter
 
 if TYPE_CHECKING:
-    from hmmseg.io.rig import Rig
     from hmmseg.io.trial import Trial
-    from hmmseg.segmentation.spans import Segmentation
 
 
 def segment(

@@ -27,7 +27,10 @@ def draw_all(
     body = found.body
     draw_heat_map(body, subtasks, path("gap_where.png"))
     draw_suspects(body, path("gap_probabilities.png"))
-    draw_signal(found, path("gap_signal.png"))
+    if isinstance(found, GenericDiagnosis):
+        _draw_mean_course(found, path("gap_signal.png"))
+    else:
+        _draw_trial(found, path("gap_signal.png"))
     if body.get("shrinkage") and body["shrinkage"].get("before") is not None:
         draw_how_far(body, path("gap_before_after.png"))
 
@@ -112,14 +115,6 @@ def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
     if channel == "grip":
         return np.minimum(world.force[trial, :, 0], -world.force[trial, :, 2])
     return channels(world)[trial, :, list(CHANNELS).index(channel)]
-
-
-def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
-    """Draw the signal with the largest excess, and its whitened residual beneath."""
-    if isinstance(found, GenericDiagnosis):
-        _draw_mean_course(found, path)
-    else:
-        _draw_trial(found, path)
 
 
 def _draw_trial(found: Diagnosis, path: Path) -> None:

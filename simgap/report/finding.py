@@ -133,11 +133,6 @@ def probability(body: Body) -> float:
     return float(body["probabilities"].get(name, 0.0))
 
 
-def sureness(p: float) -> str:
-    """A probability in words."""
-    return next(word for least, word in SURE if p >= least)
-
-
 def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The causes in plain words, with a robot's parameter values."""
     name = "+".join(body["causes"])
@@ -190,7 +185,8 @@ def sentences(body: Body) -> list[str]:
         text = f"Recording and model differ beyond noise ({p}); no known cause explains the larger part."
         return [text, *doubted(body), *moving(body)]
     chance = probability(body)
-    out = [f"{sureness(chance)[0].upper()}{sureness(chance)[1:]} ({percent(chance)})."]
+    word = next(word for least, word in SURE if chance >= least)
+    out = [f"{word.capitalize()} ({percent(chance)})."]
     if verdict == "set":
         others = ", or ".join(plain_name(n) for n in body["indistinguishable"])
         out.append(f"These recordings cannot tell it from {others}.")

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.special import gammaincinv
 
 from hmmseg.hand.signals import Signals, task_space
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
@@ -163,12 +163,8 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     motion = rollout(constants, start, *moved, CONTROL_PERIOD, substeps_for(constants, CONTROL_PERIOD))
     motion = jax.tree.map(lambda a: np.asarray(a)[: t.size], motion)
     force = interpolated(signals.t, t, motion.force)
-    return Replay(signals, force, _forces(signals).reshape(-1, 2, 2), t, motion)
-
-
-def _forces(signals: Signals) -> np.ndarray:
-    """Measured forces fx1, fy1, fx2, fy2 (T, 4) [N]."""
-    return np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], 1)
+    measured = np.stack([getattr(signals, name) for name in FORCE_CHANNELS], 1)
+    return Replay(signals, force, measured.reshape(-1, 2, 2), t, motion)
 
 
 def finger_motion(signals: Signals) -> Motion:

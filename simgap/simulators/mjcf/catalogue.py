@@ -47,7 +47,9 @@ def offered(
     """Set the simulator's parameters, and return the candidates beyond them."""
     motions = [motion_of(simulator, log) for log in recordings]
     catalogue = _Catalogue(simulator)
-    joints = catalogue.driven_joints()
+    m, read = simulator.model, simulator.joints.values()
+    moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in (HINGE, SLIDE) and name_of(m, "joint", j)]
+    joints = [j for j in moving if j in read]
     catalogue.add_joints(joints, motions)
     catalogue.add_ties()
     catalogue.add_actuators()
@@ -82,12 +84,6 @@ class _Catalogue:
         self.settings[name] = setting
         self.parameters[name] = Parameter(nominal, float(sd), setting.unit, min(low, nominal), high, effect)
         self.says[effect or name] = says or f"{name} is not as the model has it"
-
-    def driven_joints(self) -> list[int]:
-        """Named hinges and slides that are read as joints."""
-        m, read = self.model, self.simulator.joints.values()
-        moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in (HINGE, SLIDE) and name_of(m, "joint", j)]
-        return [j for j in moving if j in read]
 
     def add_joints(self, joints: Sequence[int], motions: Sequence[Motion]) -> None:
         """Friction, rotor inertia and stiffness of joints; friction by load, speed, direction; and drag."""
