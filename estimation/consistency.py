@@ -66,13 +66,12 @@ FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
 @dataclass(frozen=True)
 class Grip:
-    """Where the fingertips hold a standing block [m] before (`pickup`) or after (`place`) a move, on
-    `beneath`."""
+    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move."""
 
     move: int
     key: str
     object: str
-    beneath: tuple[str, ...]
+    beneath: tuple[str, ...]  # objects from its support down to the ground
     subtask: int
     x1: float
     x2: float
@@ -393,8 +392,7 @@ class ForceScale:
 def force_scale(
     doubts: Mapping[str, PadDoubt], weighed: Sequence[WeighedTrial], rig: Rig
 ) -> ForceScale | None:
-    """Scale of the forces if pads and noise give evidence against 1; late forces flatten the slopes it
-    needs."""
+    """Scale of the forces if pads and noise give evidence against 1; not for late forces."""
     tip = rig.fingertip
     if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
         return None

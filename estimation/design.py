@@ -37,8 +37,7 @@ Terms = dict[str, int]
 
 
 def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[Terms]:
-    """Independent integer combinations of the unknowns in `order` that span `rows`, coprime, single ones
-    first."""
+    """Independent coprime combinations of the unknowns in `order` that span `rows`, single ones first."""
     given = [_whole({k: Fraction(v) for k, v in r.items() if v}, order) for r in rows if any(r.values())]
     echelon = [_whole(row, order) for row in _echelon(given, order)]
     single = [row for row in echelon if len(row) == 1]
@@ -213,9 +212,8 @@ def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
 def nuisances(
     rig: Rig, biased: np.ndarray, doubts: Mapping[str, PadDoubt], touch_sd: float = 0.0
 ) -> tuple[Nuisance, ...]:
-    """Deviations that the rig admits, and those that recordings reveal. `biased` (4,): extra prior sd of each
-    force bias [N]; `doubts`: about the pads, "normal" and "shear"; `touch_sd` [m]: uncertainty of the
-    distance at which the fingers touch a block."""
+    """Deviations that the rig admits or recordings reveal: `biased` (4,), extra prior sd of each force bias
+    [N], `doubts` about both pads, `touch_sd` [m] of the distance at which fingers touch a block."""
     s, out = rig.systematic, list[Nuisance]()
 
     def admit(name: str, sd: float, step: float, read: Callable[[Trial, Rig, float], Signals]) -> None:
@@ -286,8 +284,7 @@ def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.nda
 def pad_doubts(
     slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
 ) -> dict[str, PadDoubt]:
-    """Evidence of slopes (num_trials, num_moves, len(SLOPES)), as of `slope_variances`, against the rig's
-    pads."""
+    """Evidence of slopes (num_trials, num_moves, len(SLOPES)), as of `slope_variances`, against the pads."""
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
     for s, grip in ((a.signals, grip) for a in weighed for grip in a.grips.values()):
         along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2

@@ -115,8 +115,7 @@ class SlipEvidence:
 def slip_evidence(
     stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
 ) -> SlipEvidence:
-    """Evidence for slip in one block's grips, of this bound (num_draws,); `others` show drift without
-    slip."""
+    """Evidence for slip in one block's grips, of this bound (num_draws,); `others` show usual drift."""
     stretches = [s for s in stretches if s.t.size > 2]
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)

@@ -250,7 +250,7 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
 
 
 def source_subtasks(described: Decomposition, obj: str, prop: str) -> list[str]:
-    """Names, such as `carry block1`, of the subtasks whose samples determine this property."""
+    """Names of the subtasks whose samples determine this property, as `carry block1`."""
     evidence = [e for e in described.properties[obj][prop].evidence if e.condition is None]
     return list(dict.fromkeys(described.subtasks[k].label for one in evidence for k in one.subtasks))
 

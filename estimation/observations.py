@@ -44,8 +44,7 @@ class Noise:
 
 
 def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str, float]:
-    """Nominal noise of one sample behind each mean [N, m], NaN if unstated; none for a sensor in the
-    wrist."""
+    """Nominal noise of one sample behind each mean [N, m], NaN if unstated; none for a wrist's sensor."""
     pads, out = pads_of(aligned.rig), dict[str, float]()
     if any(one.trial.inertia is not None for one in aligned.trials):
         return out
@@ -85,8 +84,8 @@ def estimated_noise(pooled: dict[str, list], scales: dict[str, float], stated: d
 
 def autocorrelation_time(series: list[np.ndarray]) -> float:
     """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH: Geyer's (1992)
-    initial positive sequence, below 1 if successive residuals cancel, as in differentiated noise.
-    Autocorrelations about a series' own mean are biased by -1 / length, which is corrected."""
+    initial positive sequence, below 1 if successive residuals cancel. Autocorrelations about a series' own
+    mean are biased by -1 / length, which is corrected."""
     power, size = sum(float(r @ r) for r in series), sum(r.size for r in series)
     bias = len(series) / max(size, 1)
 
@@ -163,8 +162,7 @@ def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
 
 
 def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
-    """Which subtasks shown (num_subtasks,) determine properties: a grip without its carry may hold
-    anything."""
+    """Which subtasks shown (num_subtasks,) determine properties: not those of a grip without its carry."""
     out = present.copy()
     for carry in steps:
         if carry.state == ABOVE_GROUND and not present[carry.index]:

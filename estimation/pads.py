@@ -34,8 +34,7 @@ SLOPE_SD = 0.1
 
 @dataclass(frozen=True, repr=False)
 class Slope(Brief):
-    """A slope over the give as a weighted sum of readings (num_timesteps,); `alike`: error common to all
-    slopes."""
+    """A slope over the give as a weighted sum of readings (num_timesteps,); `alike`: common error of all."""
 
     weights: np.ndarray
     variance: float

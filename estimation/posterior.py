@@ -144,8 +144,7 @@ class Posterior:
         return np.concatenate(parts)
 
     def given(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (W, Q + N + 6), q relative to `reference`, and Cholesky factor of the precision given
-        scales."""
+        """Mean (W, Q + N + 6), q relative to `reference`, and Cholesky factor of the precision."""
         precision, gradient, _ = normal_equations(theta, self.model)
         return np.linalg.solve(precision, gradient[..., None])[..., 0], np.linalg.cholesky(precision)
 
@@ -195,8 +194,7 @@ STARTS = np.arange(-1.0, 9.0, 1.0)  # numerics: log(share / prior median); a lar
 
 @dataclass(frozen=True)
 class Mode:
-    """Mode (6,) of the scales, their covariance (6, 6), unknowns (Q,) there and their conditional one (Q,
-    Q)."""
+    """Mode (6,) of the scales, their covariance (6, 6), unknowns (Q,) there and their own (Q, Q)."""
 
     scales: np.ndarray
     covariance: np.ndarray
@@ -227,8 +225,7 @@ def find_mode(post: Posterior) -> Mode:
 
 @lru_cache
 def _climb() -> Callable[[np.ndarray, Model], Any]:
-    """Map a start (6,) to the nearest maximum (6,) of the density, on the CPU: one program per padded
-    size."""
+    """Map a start (6,) to the nearest maximum (6,) of the density, on the CPU; one program a padded size."""
     import jax  # these are slow to import
     import jax.numpy as jnp
     import optimistix

@@ -75,9 +75,8 @@ def segment_apart(
     paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
     advance: Callable[[int], None], tell: Callable[[str], None],
 ) -> Iterator[Segmented]:  # fmt: skip
-    """Results of `segment_one`, in the order of the paths; `advance` gets the number of further ones done. A
-    recording whose worker is lost is segmented once more by itself, then left out with a warning to `tell`.
-    InputError if a recording or the cluster is at fault."""
+    """Results of `segment_one` in order; `advance` gets the number of further ones done. One whose worker is
+    lost is segmented once more, then left out with a warning to `tell`. InputError for bad recordings."""
     left, lab = list(paths), (task.absolute(), rig.absolute())
     while left:
         with _executor(workers, scheduler) as executor:

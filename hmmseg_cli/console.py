@@ -72,9 +72,8 @@ def _write_groups(formatter: Any, rows: Iterable[tuple[str, tuple[str, str] | No
 
 
 class Output:
-    """Destinations of one command's results: screen, JSON document, figures and report. `figure` and `stage`
-    return paths to write to, and `finish` puts everything in place. InputError at once if one cannot be
-    written."""
+    """Destinations of one command's results. `figure` and `stage` return paths to write to, and `finish` puts
+    everything in place. InputError at once if one cannot be written."""
 
     def __init__(self, command: str, *, json: str | None = None, figures: Path | None = None,
                  report: Path | None = None, seed: int = 0, quiet: bool = False) -> None:  # fmt: skip
@@ -115,8 +114,7 @@ class Output:
         self._cleanup.close()
 
     def print(self, *renderables: Any, whole: bool = False) -> None:
-        """Show tables or text, on standard error if `--json -` takes standard output; `whole`: without
-        wrapping."""
+        """Show tables or text, on standard error if `--json -` takes standard output; `whole`: unwrapped."""
         for renderable in renderables:
             with self._console.unless_lost():
                 self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
@@ -290,8 +288,7 @@ def named(where: str) -> Iterator[None]:
 
 
 def check_folder(option: str, folder: Path, shown: Path | None = None) -> None:
-    """InputError, about the folder or what is `shown`, unless files can be written there; it need not
-    exist."""
+    """InputError, about the folder or what is `shown`, unless files can be written there; it may be new."""
     existing, where = folder.absolute(), f"{option} {shown or folder}"
     with named(where):
         while not existing.exists():

@@ -23,7 +23,6 @@ from hmmseg_cli import (
     describe,
     diagnose,
     doctor,
-    fit,
     identify,
     inspect,
     play,
@@ -58,7 +57,7 @@ COMMANDS = {
         segment.segment: "hmmseg segment trial_*.csv --figures figures/",
         identify.identify: "hmmseg identify trial_*.csv --report report.html",
         watch.watch: "robot --csv | hmmseg watch --task task.toml --rig rig.toml",
-        fit.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
+        segment.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
     },
     "Why simulation and recording differ": {
         robot.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",

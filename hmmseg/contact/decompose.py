@@ -375,9 +375,8 @@ VARYING_LOAD = "the vertical force must vary while the object slides"
 
 
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
-    """For each performed move its 0-based index and the rise of its object's bottom as a sum of object
-    heights, {object: coefficient}; {} for a slide. The paper's height of a block beneath (Table 3) has one
-    coefficient."""
+    """For each performed move its 0-based index and the rise of its object's bottom, as a sum {object:
+    coefficient} of object heights; {} for a slide. The paper's Table 3 has one coefficient."""
     held, equations = [step for step in subtasks(task) if step.state != FREE], []
     for move, (start, end) in enumerate(zip(held[::3], held[2::3], strict=True)):
         rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}

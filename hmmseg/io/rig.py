@@ -111,8 +111,7 @@ def direction(axis: str) -> Any:
 
 
 class Finger(StrictTable):
-    """One planar two-link finger with absolute link angles (parallelogram linkage): tip = base + sum of L
-    (cos q, sin q), in m."""
+    """One planar two-link finger with absolute link angles: tip = base + sum of L (cos q, sin q), in m."""
 
     base: tuple[Finite, Finite]
     links: tuple[Link, Link]

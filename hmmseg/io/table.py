@@ -122,8 +122,7 @@ def holds_text(values: np.ndarray) -> bool:
 
 
 def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
-    """A column of times (num_rows,) [s], of dates since the first, whose ns since 1970 are returned as
-    well."""
+    """A column of times (num_rows,) [s], of dates since the first, and the first in ns since 1970."""
     column = table.columns[name]
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.float64) * 1e-9, None

@@ -135,9 +135,8 @@ def _learn_course(
 
 
 def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, share: float) -> np.ndarray:
-    """Log probability (number - 1,) that each change is real, against one state on both sides: by `share`
-    independent observations per cell, each side with its own mean and variance per channel (Schwarz
-    criterion)."""
+    """Log probability (number - 1,) that each change is real, against one state on both sides, by `share`
+    independent observations per cell and the Schwarz criterion."""
     bridged = [np.arcsinh(fill_gaps(v)) for v in values]
     stacked, path = np.vstack(bridged), np.concatenate(paths)
     features = stacked.shape[1]

@@ -168,8 +168,7 @@ def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence
 
 
 def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
-    """The chain with log weights (num_cells - 1, num_boundaries) of crossing, two where a state is
-    skipped."""
+    """The chain with log weights (num_cells - 1, num_boundaries) of crossing, both of a skipped state."""
     total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
     stay, *jumps = chain.bands
     advance, *skips = (band + total[:, d:] - total[:, :-d] for d, band in enumerate(jumps, 1))
@@ -246,8 +245,7 @@ def weigh(values: np.ndarray, emissions: StudentEmissions, law: Chain,
 
 
 def durations(probability: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean durations [cells] and presence (num_states,), with a Beta(1, 1) prior, from posterior
-    probabilities."""
+    """Mean durations [cells] and presence (num_states,), with a Beta(1, 1) prior, from posteriors."""
     visited = np.array([p.max(0) for p in probability])
     cells = np.sum([p.sum(0) for p in probability], 0) / np.maximum(visited.sum(0), 0.5)
     return np.maximum(cells, LEAST_CELLS), (visited.sum(0) + 1) / (len(probability) + 2)

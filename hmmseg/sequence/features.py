@@ -47,8 +47,7 @@ class SequenceFeatures:
 
 
 def drop_repeats(values: np.ndarray) -> np.ndarray:
-    """A channel (num_timesteps,) without repeated readings (NaN) if no two consecutive samples both
-    change."""
+    """A channel (num_timesteps,) without repeated readings (NaN) if it is sampled more slowly than rows."""
     changes = np.flatnonzero(np.diff(values) != 0) + 1
     if changes.size < FEWEST or (period := int(np.diff(changes).min())) < 2:
         return values
@@ -58,7 +57,7 @@ def drop_repeats(values: np.ndarray) -> np.ndarray:
 
 
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (num_cells + 1,) and means (num_cells, num_channels), NaN in empty cells; InputError if one
+    """Edges (num_cells + 1,), means (num_cells, num_channels), NaN in empty cells; InputError if one
     lacks."""
     for name in channels:
         if name not in trial.channels:

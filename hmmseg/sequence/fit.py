@@ -71,10 +71,9 @@ def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | N
 
 
 def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:
-    """Known boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown, from entries for each or by
-    name (with or without suffix), or a folder or table for `label_files`. An entry holds boundaries, None
-    where unknown, or {subtask: its start}; a skipped subtask has two equal ones. InputError if they do not
-    fit."""
+    """Known boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown, from an entry for each or by
+    name, or a folder or table for `label_files`. An entry holds boundaries, None where unknown, or {subtask:
+    its start}; a skipped subtask has two equal ones. InputError if they do not fit."""
     if isinstance(labels, str | Path):
         labels = label_files(Path(labels), trials)
     if isinstance(labels, Mapping):
@@ -100,9 +99,9 @@ def _is_named(name: str, trial: Trial) -> bool:
 
 
 def label_files(where: Path, trials: Sequence[Trial]) -> dict[str, Any]:
-    """Entries for `read_labels` by the trials' names, from a folder with NAME.json, {"boundaries": [times in
-    s, null where unknown]}, or a table (CSV, TSV) with the columns trial, subtask and start [s]; InputError
-    if none is there."""
+    """Entries for `read_labels` by the trials' names, from a folder with NAME.json, {"boundaries": [s or
+    null, ...]}, or a table (CSV, TSV) with the columns trial, subtask and start [s]; InputError if there is
+    none."""
     if where.is_dir():
         files = {trial.name: where / f"{trial.stem}.json" for trial in trials}
         out = {name: _boundaries(path) for name, path in files.items() if path.exists()}
@@ -187,8 +186,7 @@ def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
 
 
 def label_constraints(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
-    """Log weights (num_cells, num_states), 0 or -inf, that keep labels [s] within a cell; None without
-    any."""
+    """Log weights (num_cells, num_states), 0 or -inf, that keep labels [s] within a cell; None without."""
     if not np.isfinite(boundaries).any():
         return None
     reach, out = trial.edges[1] - trial.edges[0], np.zeros((len(trial.middle), num_states))

@@ -97,9 +97,8 @@ class SequenceModel(Tabled):
         return align([ll], [chain])[0]
 
     def misfit(self, trial: SequenceFeatures) -> tuple[np.ndarray, np.ndarray, AlignmentPosterior]:
-        """How badly a trial fits, without boundary templates: log evidence of free switching over forced
-        order [nats] and minus log evidence per cell (2,); log-likelihoods (num_cells, num_states); the
-        alignment. Evidence of models learned without labels is coarsened."""
+        """How badly a trial fits without boundary templates: log evidence of free switching over forced order
+        [nats], minus log evidence per cell (2,); log-likelihoods; alignment. Unlabelled, it is coarsened."""
         model, temper = replace(self, detectors=None), self.emissions.temper
         if self.detectors is None:
             temper *= INDEPENDENT / (INDEPENDENT + temper * trial.values.size)
@@ -117,8 +116,8 @@ class SequenceModel(Tabled):
         return log_likelihoods, np.full(num_states, -np.log(num_states)), transition
 
     def failure(self, trial: SequenceFeatures) -> Failure | None:
-        """The first subtask at which a trial leaves the task; None where it fits. The first may be
-        cropped."""
+        """The first subtask at which a trial leaves the task, the first cropped or not; None where it
+        fits."""
         names, optional = self.task.sequence, optional_states(self.task, settled=False)
         scores, ll, alignment = self.misfit(trial)
         cells = alignment.smoothed.sum(axis=0)
@@ -144,8 +143,7 @@ def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
 
 
 def usual_misfit(scores: Sequence[np.ndarray]) -> np.ndarray:
-    """Median and width (2, 2) of each score [(2,), ...] over the training trials, widened for their
-    number."""
+    """Median and width (2, 2) of each score [(2,), ...] over the training trials, wider if they are few."""
     center = np.median(scores, axis=0)
     width = NORMAL * np.median(np.abs(np.array(scores) - center), axis=0)
     return np.column_stack([center, np.maximum(width, LEAST_WIDTH) * (1 + FEW / len(scores))])

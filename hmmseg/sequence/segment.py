@@ -62,8 +62,7 @@ def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse],
 
 def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
     """Places [s] of one boundary, most probable first; none where one is SURE. `crossing` (num_cells - 1,):
-    its probability at the inner `edges` (num_cells + 1,) [s]; `answer`: the reported time, the first
-    place."""
+    its probability at the inner `edges` (num_cells + 1,) [s]; `answer`: the first place."""
     inner, left = edges[1:-1], crossing / crossing.sum()
     reach = NEAR * (edges[-1] - edges[0])
     low = np.searchsorted(inner, inner - reach)
@@ -93,10 +92,9 @@ _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interva
 
 def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
                      model: SequenceModel | None = None) -> list[Segmentation]:  # fmt: skip
-    """Segment recordings of a plain ordered task, by the model of `fit_sequence` or one learned from these
+    """Segment recordings of a plain ordered task, by a model of `fit_sequence` or one learned from these
     trials. A skipped optional subtask has no span; where trials can be read in several ways, spans have
-    `alternatives` and a segmentation a `question`. InputError where trials, task and model do not go
-    together."""
+    `alternatives` and a segmentation a `question`. InputError if trials, task and model do not fit."""
     if model is None:
         model = fit_sequence(trials, task)
     elif model.task.sequence != task.sequence:

@@ -109,8 +109,7 @@ def next_motion(document: Mapping[str, Any], logs: Iterable[Recording]) -> Recor
 def motion_csv(
     log: Recording, commands: Sequence[str], own: Mapping[str, Own], time: tuple[str, float]
 ) -> str:
-    """The commands of a motion as CSV in the columns' own units; `time`: name of the time column, its unit
-    [s]."""
+    """The commands of a motion as CSV in the columns' own units; `time`: its column and unit [s]."""
     columns = [(log.t - log.t[0]) / time[1]]
     columns += [own[n].of(log[n]) if n in own else log[n] for n in commands]
     lines = [",".join((time[0], *commands))]
@@ -144,8 +143,7 @@ class _Run(BaseModel):
 
 
 def history(path: Path) -> list[dict[str, Any]]:
-    """The runs in a history file, one line of JSON each, none if there is no file; InputError if one is no
-    run."""
+    """The runs in a history file, one line of JSON each, none without a file; InputError if one is no run."""
     if not path.exists():
         return []
     out = []

@@ -51,8 +51,7 @@ class UserSimulator:
 
 def load_simulator(spec: str) -> UserSimulator:
     """Load the simulator `FILE.py:NAME`, an object, a class (made without arguments) or a function with
-    attributes, with all calls checked; InputError if it is missing, fails, or declares what cannot be
-    used."""
+    attributes, all calls checked; InputError if it is missing, fails, or declares what cannot be used."""
     file, _, name = spec.rpartition(":")
     where = f"--simulator {spec}"
     if not file or not name.isidentifier():

@@ -39,9 +39,8 @@ def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) ->
 def friction(stiffness: Array, damping: Array, deflection: Array, rate: Array,
              bound: Array) -> tuple[Array, Array]:  # fmt: skip
     """Tangential force [N] and the remaining elastic deflection [m]: the contact sticks through a spring from
-    its anchor, which beyond `bound` (friction coefficient times normal force) is dragged along (return
-    mapping: Simo & Hughes, Computational Inelasticity, 1998, chapter 1; Cundall & Strack, Géotechnique 29,
-    1979)."""
+    its anchor, which beyond `bound` is dragged along (return mapping: Simo & Hughes, Computational
+    Inelasticity, 1998, chapter 1; Cundall & Strack, Géotechnique 29, 1979)."""
     limit = bound / stiffness
     deflection = jnp.clip(deflection, -limit, limit)
     return jnp.clip(stiffness * deflection + damping * rate, -bound, bound), deflection
@@ -355,8 +354,7 @@ class Impedance(NamedTuple):
 
 @partial(jax.jit, static_argnames=("substeps",))
 def perform(physics: Physics, hand: Impedance, command: Array, state: State, substeps: int) -> Record:
-    """Perform `command` (T, 4), x1, y1, x2, y2 [m] per control period, joined by lines, from rest at the
-    first."""
+    """Perform `command` (T, 4), x1, y1, x2, y2 [m] per control period, joined by lines, from rest."""
     h = CONTROL_PERIOD / substeps
     slope = jnp.diff(command, axis=0, append=command[-1:]) / CONTROL_PERIOD
     start = tips_of(jnp.concatenate([command[0], jnp.zeros(4)]))

@@ -51,8 +51,7 @@ class Motion:
 
 def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_position: np.ndarray,
            sd_velocity: np.ndarray) -> Motion:  # fmt: skip
-    """Smooth position [m] and velocity [m/s] (T, axes), NaN where missing, with noise `sd_*` of one
-    sample."""
+    """Smooth position [m] and velocity [m/s] (T, axes), NaN where missing, with noise `sd_*` of a sample."""
     weights = [np.where(np.isfinite(z), 1.0 / (TOLERANCE * sd), 0.0)
                for z, sd in ((position, sd_position), (velocity, sd_velocity))]  # fmt: skip
     samples = [np.nan_to_num(position), np.nan_to_num(velocity)]
@@ -147,8 +146,8 @@ class Replay:
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            ) -> Replay:  # fmt: skip
-    """Drive the calibrated model with a recording's motion; `boundaries` [s] locate the blocks, else it is
-    segmented."""
+    """Drive the calibrated model with a recording's motion; its `boundaries` [s], else found, place the
+    blocks."""
     signals = task_space(trial, rig)
     if boundaries is None:
         found = segment([trial], task, rig)[0]
@@ -207,9 +206,8 @@ def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarr
 def residual_summary(
     result: Replay, boundaries: Sequence[float] | np.ndarray, states: Sequence[str]
 ) -> dict[str, float]:
-    """Root mean square of the net force residual over its noise, by contact state. `states` are those of the
-    subtasks between the `boundaries` [s]; samples within 0.1 s of a boundary are left out. The noise of a net
-    force is sqrt(2) times the sensor's."""
+    """Root mean square of the net force residual over its noise, sqrt(2) times the sensor's, by contact
+    state; samples within 0.1 s of a boundary [s] are left out."""
     t, net = result.signals.t, result.residual.sum(axis=1) / (np.sqrt(2) * result.signals.sd_force)
     edges = np.concatenate([[t[0] - 1], boundaries, [t[-1] + 1]])
     inside = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(states) - 1)

@@ -75,8 +75,7 @@ class Stream:
         return list(dict.fromkeys(name for each in self.values for name in each))
 
     def columns(self, by_header: bool) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Columns named by the same messages: distinct increasing times (num_messages,) [ns], values by
-        name."""
+        """Columns named by the same messages: distinct increasing times (num_messages,) [ns], values."""
         times = np.array(self.stamped if by_header else self.logged, dtype=np.int64)
         where: dict[str, list[int]] = {}
         for i, each in enumerate(self.values):

@@ -23,8 +23,7 @@ from simgap.simulators.recording import Recording, held, read_recording
 
 @dataclass(frozen=True)
 class Loaded:
-    """A model to compare logs with, without parameters until `effects` has seen logs; `digest`: a hash of
-    it."""
+    """A model to compare logs with, without parameters until `effects` has seen logs; `digest`: its hash."""
 
     simulator: MjcfSimulator
     map: Map

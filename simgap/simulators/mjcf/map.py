@@ -43,8 +43,7 @@ Place = Annotated[Name | tuple[Finite, Finite, Finite], WrapValidator(_placed)]
 
 
 class Mapped(Quantity):
-    """One column: the joint, actuator, sensor, body or site of the model that it records; SI = sign * unit *
-    column + offset."""
+    """One column, and the part of the model that it records; SI = sign * unit * column + offset."""
 
     joint: Name | None = None
     actuator: Name | None = None

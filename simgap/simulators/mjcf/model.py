@@ -236,8 +236,7 @@ class MjcfSimulator:
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
     def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[Pairs]]:
-        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch then or a sample
-        away."""
+        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch then or next to it."""
         t, none = recording.t[self._shown(recording)], frozenset[tuple[int, int]]()
         if not self.touching:
             return t, [none] * t.size
@@ -275,8 +274,7 @@ def tied(model: Any) -> np.ndarray:
 
 
 def inner(model: Any, known: Set[int]) -> np.ndarray:
-    """Hinges and slides (k,) that neither a column nor another joint tells, where connected bodies close
-    loops."""
+    """Hinges and slides (k,) that neither a column nor another joint tells, in loops of bodies."""
     kinds = mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD
     if not (np.isin(model.eq_type, kinds) & model.eq_active0.astype(bool)).any():
         return np.zeros(0, int)

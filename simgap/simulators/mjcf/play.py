@@ -58,8 +58,7 @@ class Played:
             return self.runs([j.recording for j in jobs], own, tuple(changed))
 
     def _ahead(self, log: Recording, width: float) -> np.ndarray:
-        """How far the motor is ahead of its joint, and faster, at a log's samples (n, 2), as the model
-        came."""
+        """How far the motor is ahead of its joint, and faster, at a log's samples (n, 2)."""
         return latest(self.known, (log.name, width), lambda: self._run(log, width), KEPT)
 
     def _run(self, log: Recording, width: float) -> np.ndarray:

@@ -18,8 +18,7 @@ from simgap.simulators.recording import Recording
 
 
 class Held:
-    """Commands held from sample to sample, averaged over the simulator's steps; of one window (n,) or many
-    (B, n)."""
+    """Commands held from sample to sample, averaged over the simulator's steps; of windows (n,) or (B, n)."""
 
     def __init__(self, since: np.ndarray, times: np.ndarray) -> None:
         self.since, self.times = since, times
@@ -117,9 +116,8 @@ FAR = 1e9  # numerics: a run that reads beyond it has diverged
 
 @dataclass
 class Runs:
-    """Runs of the `model` in threads, one for each of `data`; the other fields as in `MjcfSimulator`. The
-    latest runs are kept, since a finite difference in one number of the solver includes those of all
-    others."""
+    """Runs of the `model` in threads, one for each of `data`; other fields as in `MjcfSimulator`. The latest
+    are kept, since a finite difference in one number of the solver includes those of all others."""
 
     model: Any
     data: Sequence[Any]
@@ -193,8 +191,7 @@ class Runs:
     def _read(
         self, logs: Sequence[Recording], sensed: np.ndarray, side: tuple[Held, Between], times: np.ndarray
     ) -> list[Channels | None]:
-        """Sensors (B, steps, sensors) at the logs' times, positions and velocities by cubics, others by
-        lines."""
+        """Sensors (B, steps, sensors) at the logs' times, positions and velocities by cubics."""
         smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
         held, between = side
         read = between(sensed[:, :, [self.sensor[n] for n in smooth]])

@@ -59,8 +59,7 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 
 def payload_place(model: Any, name: str) -> np.ndarray:
-    """Where a body carries a load (3,) [m]: its farthest site, else geom's centre, else its centre of
-    mass."""
+    """Where a body carries a load (3,) [m]: its farthest site, else geom, else its centre of mass."""
     b = object_id(model, "body", name)
     for places, owner in ((model.site_pos, model.site_bodyid), (model.geom_pos, model.geom_bodyid)):
         mine = np.array(places[np.asarray(owner) == b])

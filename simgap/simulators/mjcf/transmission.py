@@ -28,9 +28,8 @@ def elasticity(
     motions: Sequence[Motion],
     joints: Sequence[int],
 ) -> list[RobotEffect]:
-    """Candidates of gears that give behind an encoder at the motor. A joint lags by compliance times the
-    torque transmitted, which moves bodies and sites beyond it as they are read. Valid for motion slow against
-    the gear's own ringing."""
+    """Candidates of gears that give behind an encoder at the motor: a joint lags by compliance times the
+    torque transmitted, slowly against the gear's own ringing, which moves bodies and sites beyond it."""
     model, data = simulator.model, mujoco.MjData(simulator.model)
     columns = simulator.map.columns
     seen = {n: m for n, m in columns.items() if m.thing in ("site", "body") and m.axis in ("x", "y", "z")}
