@@ -257,8 +257,7 @@ def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[i
     values, out = {k: np.nan_to_num(v) for k, v in observations.channel_values(signals, rig).items()}, []
     for move in moves:
         counts = weighed.counts[move]
-        means = {k: np.where(counts[k] > 0, w @ values[k], np.nan)
-                 for k, w in weighed.grips[move].items()}  # fmt: skip
+        means = {k: np.where(counts[k] > 0, w @ values[k], np.nan) for k, w in weighed.grips[move].items()}
         out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
     return np.moveaxis(np.array(out), 2, 0)
 

@@ -18,20 +18,7 @@ import typer
 import hmmseg
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import configure
-from hmmseg_cli import (
-    demo,
-    describe,
-    diagnose,
-    doctor,
-    identify,
-    inspect,
-    play,
-    robot,
-    run,
-    segment,
-    simulate,
-    watch,
-)
+from hmmseg_cli import demo, describe, diagnose, identify, inspect, play, robot, run, segment, simulate, watch
 from hmmseg_cli.console import Grouped, Hmmseg, discard, escape_control
 
 # numerics: objects between two garbage collections: most belong to modules and compilers, and stay anyway
@@ -51,7 +38,7 @@ COMMANDS = {
         inspect.new: "hmmseg new my_hand --from trial_01.csv",
         inspect.inspect: "hmmseg inspect trial_01.csv",
         describe.decompose: "hmmseg decompose task.toml",
-        doctor.doctor: "hmmseg doctor",
+        describe.doctor: "hmmseg doctor",
     },
     "When and what": {
         segment.segment: "hmmseg segment trial_*.csv --figures figures/",

@@ -195,8 +195,7 @@ def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
         support[i] += jnp.maximum(fy, 0.0)
         support[j] += jnp.maximum(-fy, 0.0)
         anchors.append(anchor)
-    mapped = state._replace(pads=(tuple(pads[0]), tuple(pads[1])), ground=tuple(ground),
-                            pairs=tuple(anchors))  # fmt: skip
+    mapped = state._replace(pads=(tuple(pads[0]), tuple(pads[1])), ground=tuple(ground), pairs=tuple(anchors))
     return mapped, Loads(tuple(tip_x), tuple(tip_y), tuple(force_x), tuple(force_y),
                          (tuple(normals[0]), tuple(normals[1])), tuple(support))  # fmt: skip
 
