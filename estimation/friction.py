@@ -355,12 +355,9 @@ def _held(
 
 
 def _stretches(
-    weighed: Sequence[WeighedTrial],
-    fingers: list[list[_Forces]],
-    steps: tuple[Subtask, ...],
-    obj: str,
+    weighed: Sequence[WeighedTrial], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str,
     rig: Rig,
-) -> list[Stretch]:
+) -> list[Stretch]:  # fmt: skip
     """Each finger on the resting block, with the samples that all alignments share."""
     compliance = 1 / rig.fingertip.shear_stiffness
     out = []

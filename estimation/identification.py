@@ -92,8 +92,7 @@ class Identification(Tabled):
         friction = {obj: self.friction[obj].to_json() if obj in self.friction else None
                     for obj in self.task.objects}  # fmt: skip
         return {
-            "trials": [s.to_json() for s in self.segmentations],
-            "method": "bayes",
+            "trials": [s.to_json() for s in self.segmentations], "method": "bayes",
             "sampler": None if draws is None else {
                 "walkers": draws.chain.shape[0], "steps": draws.steps, "ess": draws.ess, "rhat": draws.rhat,
                 "acceptance": draws.acceptance, "converged": draws.converged,
@@ -207,11 +206,7 @@ def identify_aligned(
     warnings += [f"the zero of {name} {text.format(size)}" for text, sizes in (drifts, moves)
                  for name, size in zip(FORCE_CHANNELS, sizes, strict=True) if size > 0]  # fmt: skip
     warnings += dict.fromkeys(contradicted.values())
-    warnings += [
-        *checks.soft_pads(design, rig),
-        *checks.unnamed(task, design),
-        *checks.dense(task, rig, means),
-    ]
+    warnings += checks.soft_pads(design, rig) + checks.unnamed(task, design) + checks.dense(task, rig, means)
     friction = {
         k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
     }

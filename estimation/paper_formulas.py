@@ -61,11 +61,9 @@ class _Trial:
 
 
 def estimate_plugin(
-    trials_signals: Sequence[Signals],
-    segmentations: Sequence[Segmentation],
-    task: BlockTask,
+    trials_signals: Sequence[Signals], segmentations: Sequence[Segmentation], task: BlockTask,
     states: Sequence[StateLabels] | None = None,
-) -> tuple[Properties, dict[str, str]]:
+) -> tuple[Properties, dict[str, str]]:  # fmt: skip
     """The paper's estimates of every object of a task from segmented trials: entries as in identify's JSON
     with `standard_error` and normal intervals, and the reason for each missing one by `object.property`.
     `states`: contact states of each trial's samples, by default those of the paper's thresholds."""

@@ -164,13 +164,8 @@ class Output:
 
     def finish(self, document: dict[str, Any]) -> None:
         """Write the staged files and the JSON document, with `format`, `version`, ... added."""
-        envelope = {
-            "format": f"hmmseg.{self.command}/1",
-            "version": hmmseg.__version__,
-            "seed": self.seed,
-            "warnings": self.warnings,
-            "figures": [str(path) for path in self._drawn],
-        }
+        envelope = {"format": f"hmmseg.{self.command}/1", "version": hmmseg.__version__, "seed": self.seed,
+                    "warnings": self.warnings, "figures": [str(path) for path in self._drawn]}  # fmt: skip
         text = strict_json({**envelope, **document})
         if self.json not in (None, STANDARD_OUTPUT):
             self.stage(Path(self.json)).write_bytes(text.encode("utf-8", "backslashreplace"))

@@ -134,29 +134,19 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
     cells, measured = finding.by_place(body), setting.measured
     to_do = [*finding.to_do(body), *filter(None, [finding.settles(body, measured is not None)])]
     return rendered(
-        "diagnose.html.j2",
-        headline=finding.headline(body, setting.rig),
-        lines=finding.sentences(body),
-        to_do=to_do if body["verdict"] != "none" else [],
-        remains=finding.remains(body),
+        "diagnose.html.j2", headline=finding.headline(body, setting.rig), lines=finding.sentences(body),
+        to_do=to_do if body["verdict"] != "none" else [], remains=finding.remains(body),
         parameters=_parameters(effect, body["causes"], setting) if effect and body["causes"] else [],
         where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
         more_cells=max(len(cells) - MOST, 0),
         images=dict.fromkeys(("gap_where", "gap_signal", "gap_before_after")) | images,
-        suspects=_suspects(body, setting),
-        attributed=bool(body.get("attribution")),
-        robot=finding.of_robot(body),
-        compared="changes" in body,
-        motion=setting.motion,
+        suspects=_suspects(body, setting), attributed=bool(body.get("attribution")),
+        robot=finding.of_robot(body), compared="changes" in body, motion=setting.motion,
         calibrated=[(plain_name(n), *_values(n, p, shown_as(p["unit"]), setting)) for n, p in fitted.items()],
-        numerics=_numerics(body),
         properties=_properties(effect, measured) if effect and body["causes"] else [],
-        measured=measured is not None,
-        detection=_detection(body),
-        far=_far(body),
-        warnings=setting.warnings,
-        files=setting.files,
-    )
+        measured=measured is not None, numerics=_numerics(body), detection=_detection(body), far=_far(body),
+        warnings=setting.warnings, files=setting.files,
+    )  # fmt: skip
 
 
 def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:

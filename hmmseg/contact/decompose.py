@@ -315,13 +315,9 @@ class Decomposition(Tabled):
         document: dict[str, Any] = {
             "subtasks": [
                 {
-                    "index": subtask.index,
-                    "subtask": subtask.name,
-                    "object": subtask.object,
-                    "state": subtask.state,
-                    "move": None if subtask.move is None else subtask.move + 1,
-                    "support": subtask.support,
-                    "constraints": subtask.constraints,
+                    "index": subtask.index, "subtask": subtask.name, "object": subtask.object,
+                    "state": subtask.state, "move": None if subtask.move is None else subtask.move + 1,
+                    "support": subtask.support, "constraints": subtask.constraints,
                     "properties": [
                         {"property": f"{entry.object}.{entry.name}",
                          "signals": evidence.signals(subtask.index),
@@ -333,14 +329,12 @@ class Decomposition(Tabled):
                 }
                 for subtask in self.subtasks
             ],
-            "minimal": [subtask.index for subtask in self.minimal()],
-            "equation": self.equation(),
+            "minimal": [subtask.index for subtask in self.minimal()], "equation": self.equation(),
             "properties": {
                 name: {key: entry.to_json() for key, entry in entries.items()}
                 for name, entries in self.properties.items()
             },
-            "reasons": self.reasons,
-            "notes": self.notes,
+            "reasons": self.reasons, "notes": self.notes,
         }  # fmt: skip
         if isinstance(self.task, BlockTask):
             rises = height_equations(self.task)

@@ -32,11 +32,9 @@ STYLE: dict[Any, Any] = {
 
 @contextmanager
 def canvas(
-    path: Path | None,
-    width: float = WIDTH,
-    height: float = 3.0,
+    path: Path | None, width: float = WIDTH, height: float = 3.0,
     layout: Literal["constrained"] | None = "constrained",
-) -> Iterator[Figure]:
+) -> Iterator[Figure]:  # fmt: skip
     """An empty figure of this size [in], saved to `path` (kind by its suffix) when the block ends. Without
     pyplot: nothing stays open and no display is needed. Without a path the caller shows the figure; in a
     notebook, or if a script has loaded pyplot, it is one of pyplot's."""
