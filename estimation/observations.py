@@ -280,8 +280,8 @@ def free_forces(signals: Signals, weighed: WeighedTrial) -> np.ndarray:
 
 
 def _scale(trials: list[tuple[np.ndarray, np.ndarray]], groups: list[list[int]]) -> float:
-    """Robust scale of one channel's residuals, pooled over grips, each of a group of subtasks. `trials`:
-    readings (num_timesteps,) and subtask masks (num_subtasks, num_timesteps)."""
+    """Robust scale of one channel's residuals, pooled over grips, of readings by subtask masks of each
+    trial."""
     residuals = []
     for reading, best in trials:
         for indices in groups:

@@ -116,8 +116,7 @@ class SequenceModel(Tabled):
         return log_likelihoods, np.full(num_states, -np.log(num_states)), transition
 
     def failure(self, trial: SequenceFeatures) -> Failure | None:
-        """The first subtask at which a trial leaves the task, the first cropped or not; None where it
-        fits."""
+        """The first subtask at which a trial leaves the task, the first of all cropped or not; else None."""
         names, optional = self.task.sequence, optional_states(self.task, settled=False)
         scores, ll, alignment = self.misfit(trial)
         cells = alignment.smoothed.sum(axis=0)

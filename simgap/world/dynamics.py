@@ -70,8 +70,8 @@ class Physics(NamedTuple):
 
 
 class State(NamedTuple):
-    """Centres and velocities of the blocks, and the anchors of all contacts: the relative tangential
-    positions [m] at which they carry no shear."""
+    """Blocks' centres and velocities, and anchors of contacts: relative positions [m] at which there is no
+    shear."""
 
     x: Scalars
     y: Scalars

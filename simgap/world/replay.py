@@ -146,8 +146,8 @@ class Replay:
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            ) -> Replay:  # fmt: skip
-    """Drive the calibrated model with a recording's motion; its `boundaries` [s], else found, place the
-    blocks."""
+    """Drive the calibrated model with a recording's motion, blocks placed by `boundaries` [s], else by
+    segmenting."""
     signals = task_space(trial, rig)
     if boundaries is None:
         found = segment([trial], task, rig)[0]

@@ -127,8 +127,7 @@ class MjcfSimulator:
         return np.where(np.isfinite(found), found, first)
 
     def _state(self, job: Job, bare: np.ndarray | None = None, ran: np.ndarray | None = None) -> np.ndarray:
-        """Full physics state (size,) at a window's start; `bare`: what columns leave open, `ran`: the log's
-        run."""
+        """Full physics state (size,) at a window's start; `bare`: what no column tells, `ran`: the log's."""
         there = None if ran is None else ran[job.recording.first]
         if job.start is None or bare is None:
             state = self._own_state(job.recording) if there is None or not self._partial else there.copy()
