@@ -280,8 +280,7 @@ def free_forces(signals: Signals, weighed: WeighedTrial) -> np.ndarray:
 
 
 def _scale(trials: list[tuple[np.ndarray, np.ndarray]], groups: list[list[int]]) -> float:
-    """Robust scale of one channel's residuals, pooled over grips, of readings by subtask masks of each
-    trial."""
+    """Robust scale of one channel's residuals, pooled over grips, of readings and subtask masks."""
     residuals = []
     for reading, best in trials:
         for indices in groups:

@@ -160,8 +160,7 @@ _Forces = Annotated[_Four, _per_entry(FORCE_CHANNELS)]
 
 
 class Systematic(StrictTable):
-    """Standard deviations of errors common to all trials, relative unless a unit is said; one number for
-    all."""
+    """Standard deviations of errors common to all trials, relative if no unit is said; one number for all."""
 
     force_bias: _Forces = (0.0, 0.0, 0.0, 0.0)  # [N]
     force_gain: _Forces = (0.0, 0.0, 0.0, 0.0)

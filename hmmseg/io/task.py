@@ -206,8 +206,7 @@ def _parse_move(number: int, entry: Any, where: str) -> Move:
 
 
 def _check_moves(task: BlockTask, where: str) -> None:
-    """Simulate the moves until an arrangement recurs; InputError with the number of the first impossible
-    one."""
+    """Simulate the moves until an arrangement recurs; InputError with the number of an impossible one."""
     support, seen = dict(task.initial), [dict(task.initial)]
     for round_ in range(1, (MAX_REPEAT if task.repeat == "unknown" else task.repeat) + 1):
         for number, move in enumerate(task.moves, 1):

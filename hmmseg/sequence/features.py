@@ -57,8 +57,7 @@ def drop_repeats(values: np.ndarray) -> np.ndarray:
 
 
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (num_cells + 1,), means (num_cells, num_channels), NaN in empty cells; InputError for no
-    channel."""
+    """Edges (num_cells + 1,), means (num_cells, num_channels), NaN in empty cells; InputError if none."""
     for name in channels:
         if name not in trial.channels:
             raise InputError(trial.file, f"has no channel {name}", f"channels {', '.join(channels)}")

@@ -100,7 +100,7 @@ def _is_named(name: str, trial: Trial) -> bool:
 
 def label_files(where: Path, trials: Sequence[Trial]) -> dict[str, Any]:
     """Entries for `read_labels` by the trials' names, from a folder with NAME.json, {"boundaries": [s or
-    null, ...]}, or a table (CSV, TSV) with the columns trial, subtask and start [s]; InputError if there is
+    null, ...]}, or a table (CSV, TSV) with columns trial, subtask and start [s]; InputError if there is
     none."""
     if where.is_dir():
         files = {trial.name: where / f"{trial.stem}.json" for trial in trials}

@@ -70,8 +70,7 @@ class Physics(NamedTuple):
 
 
 class State(NamedTuple):
-    """Blocks' centres and velocities, and anchors of contacts: relative positions [m] at which there is no
-    shear."""
+    """Blocks' centres and velocities, and anchors of contacts: relative positions [m] without shear."""
 
     x: Scalars
     y: Scalars

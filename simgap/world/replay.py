@@ -146,8 +146,7 @@ class Replay:
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            ) -> Replay:  # fmt: skip
-    """Drive the calibrated model with a recording's motion, blocks placed by `boundaries` [s], else by
-    segmenting."""
+    """Drive the calibrated model with a recording's motion; its `boundaries` [s] place the blocks."""
     signals = task_space(trial, rig)
     if boundaries is None:
         found = segment([trial], task, rig)[0]

@@ -81,8 +81,7 @@ class Laws:
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Sensors (B, steps, sensors) of a model with laws, from states (B, size) under controls (B, steps,
-    nu)."""
+    """Sensors (B, steps, sensors) of a model with laws, from states (B, size) under controls."""
     out = np.empty((*control.shape[:2], model.nsensordata))
     plain, nu, step = np.array(model.dof_frictionloss), model.nu, mujoco.mj_step
     # Plain numbers and views of memory, several times as fast as elements and rows of arrays.
