@@ -1,7 +1,5 @@
 """The public function `identify`: it takes paths, tables and arrays as well as what was read already."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from estimation.identification import Identification, identify_aligned

@@ -6,8 +6,6 @@ p-value compares observed with replicated scatter (Gelman, Meng, Stern 1996). A 
 differ by more than sensors and hand explain.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -38,15 +36,11 @@ MEANING = {
 
 @dataclass(frozen=True)
 class PredictiveCheck:
-    """Posterior-predictive p-value per channel, and warnings for small ones.
-
-    `excess`: sd between grips beyond the sensors' noise, posterior median, per channel (N, m, m); `repeats`:
-    number of observations that determine it, 0 if only the prior does.
-    """
+    """Posterior-predictive p-value per channel, and warnings for small ones."""
 
     p_values: dict[str, float]
-    excess: dict[str, float]
-    repeats: dict[str, int]
+    excess: dict[str, float]  # sd between grips beyond the sensors' noise, posterior median [N, m, m]
+    repeats: dict[str, int]  # observations that determine it, 0 if only the prior does
     warnings: tuple[str, ...]
 
     def to_json(self) -> dict:
@@ -135,10 +129,7 @@ def misfits(aligned: AlignedTrials) -> list[str]:
 
 
 def dense(task: BlockTask, rig: Rig, found: Mapping[tuple[str, str], float]) -> list[str]:
-    """Blocks too heavy for their size in any material: forces in a smaller unit than N.
-
-    `found`: means by (object, property) [N, m].
-    """
+    """Blocks too heavy for their size in any material, as in a smaller unit than N; `found`: means [N, m]."""
     for obj in task.objects:
         weight, width = (found.get((obj, prop), 0.0) for prop in ("weight", "width"))
         height = found.get((obj, "height"), width)

@@ -28,8 +28,6 @@ Nothing checks what all of these leave invariant: the distance of the fingers' b
 and the common length of all links.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -58,14 +56,9 @@ WELL_MADE = {
 }  # fmt: skip
 # prior: sds of what is misstated, in the same units
 SIZE = {
-    "squeeze": 0.7,
-    "balance": 0.7,
-    "rigidity": 0.1,
-    "motion": 0.3,
-    "room": 0.02,
-    "support": 0.02,
+    "squeeze": 0.7, "balance": 0.7, "rigidity": 0.1, "motion": 0.3, "room": 0.02, "support": 0.02,
     "level": 0.02,
-}
+}  # fmt: skip
 COARSE = 5e-4  # limit: m; of steps of positions: pads of usual stiffness give as much in a grip
 BRIEF = 5  # numerics: fewer samples may be a glitch
 FEWEST = 8  # numerics: least samples of a carry to determine a slope
@@ -73,15 +66,12 @@ FEWEST = 8  # numerics: least samples of a carry to determine a slope
 
 @dataclass(frozen=True)
 class Grip:
-    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move.
-
-    `beneath`: objects from its support down to the ground.
-    """
+    """Where the fingertips hold a standing block [m], before (`pickup`) or after (`place`) a move."""
 
     move: int
     key: str
     object: str
-    beneath: tuple[str, ...]
+    beneath: tuple[str, ...]  # objects from its support down to the ground
     subtask: int
     x1: float
     x2: float
@@ -90,18 +80,14 @@ class Grip:
 
 @dataclass(frozen=True)
 class Tie:
-    """One tie: its violation, and the properties that depend on it.
-
-    `value` +- `error`: error of the scale; `made`: sd of healthy hands that the rig itself admits, in
-    addition to WELL_MADE; `properties` depend on it; `text` describes the violation.
-    """
+    """One tie: its violation, and the properties that depend on it."""
 
     kind: str
-    value: float
-    error: float
+    value: float  # error of the scale
+    error: float  # its uncertainty
     properties: tuple[str, ...]
-    text: str
-    made: float = 0.0
+    text: str  # describes the violation
+    made: float = 0.0  # sd of healthy hands that the rig itself admits, in addition to WELL_MADE
 
     @property
     def probability(self) -> float:
@@ -247,19 +233,15 @@ def _rigidity(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterat
         steep = float(np.median(slopes[:, k]))
         spread = robust_sd(slopes[:, k] - steep)
         error = max(spread, float(np.sqrt(np.median(variances[:, k])))) / np.sqrt(len(slopes))
-        text = (
-            f"the fingers' distance changes by {1e2 * abs(steep):.2g} cm a metre that the hand carries a "
-            f"block {axis}, which no block does: joint angles, links or bases are farther off than "
-            "[systematic] in rig.toml admits"
-        )
+        text = (f"the fingers' distance changes by {1e2 * abs(steep):.2g} cm a metre that the hand carries a "
+                f"block {axis}, which no block does: joint angles, links or bases are farther off than "
+                "[systematic] in rig.toml admits")  # fmt: skip
         yield Tie("rigidity", steep, error, ("width", "height"), text, made)
 
 
 def _motion(aligned: AlignedTrials) -> Iterator[Tie]:
     """Displacements equal integrated velocities."""
-    slopes = [
-        [scale_to_velocity(one.trial, *pair) for pair in position_pairs(one.trial)] for one in aligned.trials
-    ]
+    slopes = [[scale_to_velocity(a.trial, *pair) for pair in position_pairs(a.trial)] for a in aligned.trials]
     ratios = np.array(slopes).ravel()
     usable = ratios[np.isfinite(ratios) & (ratios > 0)]
     if usable.size < 2 or usable.size <= ratios.size / 2:
@@ -333,9 +315,7 @@ def _support(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterato
                 if (other := grips.get(there)) is not None:  # where it stands meanwhile
                     miss = max(other.x1 - grip.x2, grip.x1 - other.x2)
                     off.setdefault((grip.object, below), []).append(miss)
-    pair, miss = max(
-        ((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0.0)
-    )
+    pair, miss = max(((p, float(np.median(v))) for p, v in off.items()), key=lambda e: e[1], default=("", 0))
     if miss > 0:
         text = f"{pair[0]} stands {1e3 * miss:.2g} mm beside {pair[1]}, on which the task has it"
         yield Tie("support", miss, 0.0, ("height",), text)
@@ -386,13 +366,10 @@ TELLING = 1.0  # limit: sd of the pads' share along the grip beyond which grips 
 
 @dataclass(frozen=True)
 class ForceScale:
-    """Posterior of the factor g by which vertical forces are read too large.
+    """Posterior of the factor g by which vertical forces are read too large."""
 
-    `probability` that forces are misread; `density` (len(GRID),) of log g if they are.
-    """
-
-    probability: float
-    density: np.ndarray
+    probability: float  # that forces are misread
+    density: np.ndarray  # (len(GRID),) of log g if they are
 
     def corrected(self, chain: np.ndarray, weights: list[int], rng: np.random.Generator) -> np.ndarray:
         """Draws (walkers, steps, Q) with those of `weights` [N] divided by draws of g."""
@@ -415,10 +392,7 @@ class ForceScale:
 def force_scale(
     doubts: Mapping[str, PadDoubt], weighed: Sequence[WeighedTrial], rig: Rig
 ) -> ForceScale | None:
-    """Scale of the forces if pads and noise give any evidence against 1, else None.
-
-    Not applicable to late forces, which flatten the slopes of readings over them.
-    """
+    """Scale of the forces if pads and noise give evidence against 1; not for late forces."""
     tip = rig.fingertip
     if not np.isfinite([tip.normal_stiffness, tip.shear_stiffness]).all():
         return None

@@ -13,8 +13,6 @@ grips. Slopes over the pads' give within a grip (`estimation.pads`) show these s
 whatever the block.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -23,28 +21,9 @@ from math import gcd, lcm
 
 import numpy as np
 
-from estimation.observations import (
-    CHANNELS,
-    LEAST,
-    MIN_FREE,
-    Noise,
-    WeighedTrial,
-    autocorrelation_time,
-    channel_values,
-    free_forces,
-    gravity_factor,
-)
-from estimation.pads import (
-    SLOPE_SD,
-    UNSTATED,
-    middle_share,
-    misstated,
-    possible_share,
-    shared_error,
-    shear_give,
-    squeeze_give,
-    unit_pads,
-)
+from estimation import observations, pads
+from estimation.observations import Noise, WeighedTrial
+from estimation.pads import SLOPE_SD, UNSTATED
 from hmmseg.contact.decompose import FREE, PROPERTIES, height_equations, reduced
 from hmmseg.hand.signals import Signals, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
@@ -58,13 +37,8 @@ Terms = dict[str, int]
 
 
 def simplest_combinations(rows: Iterable[Mapping[str, int]], order: Sequence[str]) -> list[Terms]:
-    """Independent integer combinations of the unknowns in `order` that span `rows`, single ones first.
-
-    Each is {unknown: coefficient} with coprime coefficients, the first of them positive.
-    """
-    given = [
-        _whole({k: Fraction(v) for k, v in row.items() if v}, order) for row in rows if any(row.values())
-    ]
+    """Independent coprime combinations of the unknowns in `order` that span `rows`, single ones first."""
+    given = [_whole({k: Fraction(v) for k, v in r.items() if v}, order) for r in rows if any(r.values())]
     echelon = [_whole(row, order) for row in _echelon(given, order)]
     single = [row for row in echelon if len(row) == 1]
     known = {name for row in single for name in row}
@@ -93,7 +67,7 @@ def _whole(row: Mapping[str, Fraction], order: Sequence[str]) -> Terms:
     return {k: sign * v // share for k, v in whole.items()}
 
 
-FORCE, DISTANCE, RISE = range(len(CHANNELS))
+FORCE, DISTANCE, RISE = range(len(observations.CHANNELS))
 
 
 @dataclass(frozen=True)
@@ -140,7 +114,7 @@ def coefficients_of(
     unknowns: Sequence[Unknown], objects: Sequence[str], rises: dict[int, Terms]
 ) -> np.ndarray:
     """Coefficients (num_moves, 3, Q) of the unknowns in each observation of a move."""
-    out = np.zeros((len(objects), len(CHANNELS), len(unknowns)))
+    out = np.zeros((len(objects), len(observations.CHANNELS), len(unknowns)))
     heights = [i for i, u in enumerate(unknowns) if u.prop == "height"]
     names = list(dict.fromkeys(name for i in heights for name in unknowns[i].terms))
     basis = np.array([[unknowns[i].terms.get(name, 0) for name in names] for i in heights], float)
@@ -164,16 +138,12 @@ UNLIKE = 0.3  # prior: difference between both pads, as a share of their common 
 
 @dataclass(frozen=True)
 class Nuisance:
-    """One deviation of the hand: its name, prior standard deviation, and effect.
-
-    `read(trial, rig, size)` gives the task-space signals of a trial by a hand that deviates by `size` from
-    the nominal rig; `step` is a small deviation for finite differences.
-    """
+    """One deviation of the hand."""
 
     name: str
-    sd: float
-    step: float
-    read: Callable[[Trial, Rig, float], Signals]
+    sd: float  # prior
+    step: float  # a small deviation for finite differences
+    read: Callable[[Trial, Rig, float], Signals]  # signals of a trial by a hand that deviates by a size
 
 
 def _with_channel(name: str, change: Callable[[np.ndarray, float], np.ndarray]):
@@ -197,51 +167,37 @@ def _longer_link(finger: int, link: int):
 
 @dataclass(frozen=True)
 class PadDoubt:
-    """Disagreement of recordings with the rig about both pads, along the grip or in shear.
+    """Disagreement of recordings with the rig about both pads, along the grip or in shear."""
 
-    Their compliance seems 1 + `share` times the nominal; `odds` is the probability that the rig is wrong by
-    that. `apart`: error common to all slopes. `give`: possible give of pads whose stiffness the rig leaves
-    unstated, according to the recordings; 0 if it states one. `usual`: typical force of one finger in a grip,
-    or where a block is put down [N]. `seen`: the share and its sd whatever the odds, infinite if unknown.
-    """
-
-    share: float = 0.0
-    odds: float = 0.0
-    apart: float = 0.0
-    give: float = 0.0
-    usual: float = 1.0
-    seen: tuple[float, float] = (0.0, np.inf)
+    share: float = 0.0  # their compliance seems 1 + this times the nominal
+    odds: float = 0.0  # probability that the rig is wrong by that
+    apart: float = 0.0  # error common to all slopes
+    give: float = 0.0  # possible give of pads of unstated stiffness, according to the recordings
+    usual: float = 1.0  # [N] typical force of one finger in a grip, or where a block is put down
+    seen: tuple[float, float] = (0.0, np.inf)  # the share and its sd whatever the odds
 
     @property
     def extra_sd(self) -> float:
-        """Prior standard deviation of the share beyond what the rig admits.
-
-        A mixture of 0 if the rig is right, and of the share that the slopes show if it is wrong.
-        """
+        """Prior sd of the share beyond what the rig admits: 0 if it is right, the slopes' share if wrong."""
         return abs(self.share) * float(np.sqrt(self.odds))
 
     @property
     def slope_sd(self) -> float:
-        """Common error of the slopes, and of each slope on its own.
-
-        A share of the true give, and the common effect of noise in forces or places.
-        """
+        """Common error of slopes, and of each: a share of the true give, and noise in forces or places."""
         return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 
 def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None):
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
-        """Pads whose compliance is 1 + size of the nominal, so that their faces lie elsewhere under a force.
-
-        With `usual`: pads that give as force^(1 + size), as the nominal at that force; to first order.
-        """
+        """Pads of 1 + size times the nominal compliance; with `usual`, which give as force^(1 + size)."""
         signals, moved = task_space(trial, rig), {}
         for finger in fingers:
             name = f"{'x' if kind == 'normal' else 'y'}{finger}"
             law = getattr(signals, f"f{name}")
             if usual is not None:
                 law = law * np.log(np.maximum(np.abs(law), 1e-3 * usual) / usual)
-            moved[name] = getattr(signals, name) - law * getattr(unit_pads(rig), f"{kind}{finger}") * size
+            compliance = getattr(pads.unit_pads(rig), f"{kind}{finger}")
+            moved[name] = getattr(signals, name) - law * compliance * size
         return replace(signals, **moved)
 
     return read
@@ -256,11 +212,8 @@ def _wider(trial: Trial, rig: Rig, size: float) -> Signals:
 def nuisances(
     rig: Rig, biased: np.ndarray, doubts: Mapping[str, PadDoubt], touch_sd: float = 0.0
 ) -> tuple[Nuisance, ...]:
-    """Deviations that the rig admits, and those that recordings reveal.
-
-    `biased` (4,): extra prior sd of each force bias [N]; `doubts`: about the pads, "normal" and "shear";
-    `touch_sd` [m]: uncertainty of the distance at which the fingers touch a block.
-    """
+    """Deviations that the rig admits or recordings reveal: `biased` (4,), extra prior sd of each force bias
+    [N], `doubts` about both pads, `touch_sd` [m] of the distance at which fingers touch a block."""
     s, out = rig.systematic, list[Nuisance]()
 
     def admit(name: str, sd: float, step: float, read: Callable[[Trial, Rig, float], Signals]) -> None:
@@ -301,18 +254,17 @@ SLOPES = {"distance": (DISTANCE, "distance"), "rise": (RISE, "place"), "landing"
 
 def observe(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Observed means (num_alignments, num_moves, 3) of one trial, NaN where nothing was recorded."""
-    values, out = {k: np.nan_to_num(v) for k, v in channel_values(signals, rig).items()}, []
+    values, out = {k: np.nan_to_num(v) for k, v in observations.channel_values(signals, rig).items()}, []
     for move in moves:
         counts = weighed.counts[move]
-        means = {k: np.where(counts[k] > 0, w @ values[k], np.nan)
-                 for k, w in weighed.grips[move].items()}  # fmt: skip
+        means = {k: np.where(counts[k] > 0, w @ values[k], np.nan) for k, w in weighed.grips[move].items()}
         out.append([means["force"], means["distance"], means["place"] - means["pickup"]])
     return np.moveaxis(np.array(out), 2, 0)
 
 
 def observe_slopes(signals: Signals, weighed: WeighedTrial, rig: Rig, moves: Sequence[int]) -> np.ndarray:
     """Slopes of readings over the pads' give (num_moves, len(SLOPES)) of one trial, NaN where absent."""
-    values, out = channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
+    values, out = observations.channel_values(signals, rig), np.full((len(moves), len(SLOPES)), np.nan)
     for i, move in enumerate(moves):
         for k, (name, (_, reading)) in enumerate(SLOPES.items()):
             slope = weighed.slopes.get(move, {}).get(name)
@@ -331,10 +283,7 @@ def slope_variances(weighed: WeighedTrial, moves: Sequence[int]) -> tuple[np.nda
 def pad_doubts(
     slopes: np.ndarray, variance: np.ndarray, alike: np.ndarray, weighed: Sequence[WeighedTrial], rig: Rig
 ) -> dict[str, PadDoubt]:
-    """Evidence of slopes (num_trials, num_moves, len(SLOPES)) against the rig's pads, "normal" and "shear".
-
-    `variance`, `alike`: as in `slope_variances`, of all trials.
-    """
+    """Evidence of slopes (num_trials, num_moves, len(SLOPES)), as of `slope_variances`, against the pads."""
     usual = []  # mean forces of one finger along the grip, and in shear where the block is put down
     for s, grip in ((a.signals, grip) for a in weighed for grip in a.grips.values()):
         along, up = np.nan_to_num(s.fx1 - s.fx2) / 2, np.nan_to_num(s.fy) / 2
@@ -347,10 +296,10 @@ def pad_doubts(
         stated = bool(np.isfinite(getattr(rig.fingertip, f"{kind}_stiffness")))
         own = np.isfinite(slopes) & (np.array([c for c, _ in SLOPES.values()]) == channel)
         shares, spread = sign * slopes[own], variance[own]
-        apart = shared_error(alike[own], spread)
-        middle, error = middle_share(shares, spread, 0.0) if shares.size else (0.0, np.inf)
-        share, odds = misstated(shares, spread, stated, admitted if stated else 0.0, apart)
-        give = 0.0 if stated else possible_share(shares, spread)
+        apart = pads.shared_error(alike[own], spread)
+        middle, error = pads.middle_share(shares, spread, 0.0) if shares.size else (0.0, np.inf)
+        share, odds = pads.misstated(shares, spread, stated, admitted if stated else 0.0, apart)
+        give = 0.0 if stated else pads.possible_share(shares, spread)
         out[kind] = PadDoubt(share, odds, apart, give, force, (middle, float(np.hypot(error, apart))))
     return out
 
@@ -367,20 +316,18 @@ def sampling_variance(weighed: WeighedTrial, noise: Noise, moves: Sequence[int])
 
 
 def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndarray:
-    """Units of the shares of model error (num_trials, num_moves, 3) [N, m, m].
-
-    That of a rise is at least the give under the weight, and the change of give in landing: what a pad does
-    in between need not cancel where contact forces balance.
-    """
+    """Units of the shares of model error (num_trials, num_moves, 3) [N, m, m]. That of a rise is at least the
+    give under the weight, and the change of give in landing: what a pad does in between need not cancel where
+    contact forces balance."""
     force = np.abs(raw[..., FORCE]).mean(axis=1)
     force = np.where(np.isfinite(force), force, np.nanmean(force) if np.isfinite(force).any() else 1.0)
     gives = []
     for a in weighed:
-        squeeze, shear = (np.nan_to_num(give(a.signals, rig)) for give in (squeeze_give, shear_give))
+        squeeze, shear = (np.nan_to_num(of(a.signals, rig)) for of in (pads.squeeze_give, pads.shear_give))
         gives.append([(np.mean(w["distance"] @ squeeze), *(np.mean(w[k] @ shear) for k in
                       ("pickup", "force", "place"))) for w in a.grips.values()])  # fmt: skip
     grip, picked, carried, placed = np.moveaxis(np.array(gives), -1, 0)
-    hanging = np.maximum(force, 1e-3) * (unit_pads(rig).shear1 + unit_pads(rig).shear2) / 4
+    hanging = np.maximum(force, 1e-3) * (pads.unit_pads(rig).shear1 + pads.unit_pads(rig).shear2) / 4
     least = np.maximum(hanging, np.abs(placed - carried))
     rise = np.where(placed < picked, -1.0, 1.0) * np.maximum(np.abs(placed - picked), least)
     return np.stack([force, np.maximum(grip, 1e-7), rise], axis=-1)
@@ -389,12 +336,10 @@ def units(weighed: Sequence[WeighedTrial], raw: np.ndarray, rig: Rig) -> np.ndar
 def free_means(
     weighed: Sequence[WeighedTrial], noise: Noise, free_steps: Sequence[int], rig: Rig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N].
-
-    A zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and
-    the rig's own bias allow, is known in a grip no better than these stretches agree.
-    """
-    mean = np.stack([free_forces(a.signals, a) for a in weighed])
+    """Mean forces in free motion (num_trials, 4), their variances, and how far each zero moves (4,) [N]. A
+    zero that moves between the free stretches of a trial (subtasks `free_steps`), beyond what noise and the
+    rig's own bias allow, is known in a grip no better than these stretches agree."""
+    mean = np.stack([observations.free_forces(a.signals, a) for a in weighed])
     count = np.array([max(a.free_count, 1.0) for a in weighed])
     of_sample = np.array([noise.variance[name] for name in FORCE_CHANNELS])
     variance = of_sample[None, :] / count[:, None] + np.array([a.rounding**2 for a in weighed])
@@ -405,12 +350,12 @@ def free_means(
 def _zeros(a: WeighedTrial, free_steps: Sequence[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean times (N,) of halves of free stretches of a trial, mean forces (N, 4) there, and their errors."""
     spans = [np.flatnonzero((a.masks[:, k].mean(axis=0) > 0.5) & (a.free > 0)) for k in free_steps]
-    halves = [half for span in spans for half in np.array_split(span, 2) if half.size >= MIN_FREE]
+    halves = [h for span in spans for h in np.array_split(span, 2) if h.size >= observations.MIN_FREE]
     if not halves:
         return np.zeros(1), np.zeros((1, 4)), np.ones((1, 4))
     each = [np.stack([getattr(a.signals, name)[half] for name in FORCE_CHANNELS]) for half in halves]
-    noise = [[r.var() * autocorrelation_time([r - r.mean()]) for r in four] for four in each]
-    spread = np.median(noise, axis=0) + LEAST**2
+    noise = [[r.var() * observations.autocorrelation_time([r - r.mean()]) for r in four] for four in each]
+    spread = np.median(noise, axis=0) + observations.LEAST**2
     errors = np.sqrt([spread / half.size + a.rounding**2 for half in halves])
     means = np.array([four.mean(axis=1) for four in each])
     return np.array([a.signals.t[half].mean() for half in halves]), means, errors
@@ -453,11 +398,9 @@ BIASED = 0.0025  # prior: share of forces with a wrong nominal zero: all four in
 
 
 def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndarray:
-    """Extra prior sd (4,) of force biases [N] that free motion shows and the rig does not admit.
-
-    Forces in free motion should vanish, up to noise and the rig's own [systematic]. A bias as wide as their
-    pooled mean explains that better by (z^2 - 1) / 2 - log z nats; it is allowed if that makes it probable.
-    """
+    """Extra prior sd (4,) of force biases [N] that free motion shows and the rig does not admit. Forces in
+    free motion should vanish, up to noise and the rig's own [systematic]. A bias as wide as their pooled mean
+    explains that better by (z^2 - 1) / 2 - log z nats; it is allowed if that makes it probable."""
     precision = 1.0 / variance
     total = np.maximum(precision.sum(axis=0), np.finfo(float).tiny)  # a force that is never read has none
     pooled = (mean * precision).sum(axis=0) / total
@@ -468,40 +411,31 @@ def unexpected_bias(mean: np.ndarray, variance: np.ndarray, rig: Rig) -> np.ndar
 
 @dataclass(frozen=True)
 class Design:
-    """Arrays of the linear-Gaussian core; K observations, Q unknowns, N deviations of the hand.
-
-    `mean`, `variance` (K,) of the observations, drawn alignments combined; `coefficients` (K, Q); `shifts`
-    (K, N) per standard deviation of each deviation; `channel` (K,): index into CHANNELS; `unit` (K,): of the
-    shares of model error; `trial`, `move` (K,): source; `slope` (K,): whether a slope over the give rather
-    than a mean (its shares are those of the mean). `slope_sd` (3,): by channel, the error common to all
-    slopes and that of each. `free_mean`, `free_variance` (num_trials, 4) and `free_shifts` (num_trials, 4,
-    N): forces in free motion. `scale_count` (3,): samples behind each noise variance; `unexpected`: force
-    biases that free motion shows and the rig does not admit; `doubts`: the same for the pads; `level_rises`:
-    mean recorded rise by move between equal heights [m]; `moved` (4,): how far the forces' zeros move within
-    a trial [N].
-    """
+    """Arrays of the linear-Gaussian core; K observations, Q unknowns, N deviations of the hand."""
 
     unknowns: tuple[Unknown, ...]
     nuisances: tuple[Nuisance, ...]
-    mean: np.ndarray
-    variance: np.ndarray
-    coefficients: np.ndarray
-    shifts: np.ndarray
-    channel: np.ndarray
-    unit: np.ndarray
-    trial: np.ndarray
-    move: np.ndarray
-    slope: np.ndarray
-    free_mean: np.ndarray
-    free_variance: np.ndarray
-    free_shifts: np.ndarray
-    scale_count: np.ndarray
-    slope_sd: np.ndarray = field(default_factory=lambda: np.full(len(CHANNELS), SLOPE_SD))
-    unexpected: tuple[Nuisance, ...] = ()
+    mean: np.ndarray  # (K,) of the observations, drawn alignments combined
+    variance: np.ndarray  # (K,) likewise
+    coefficients: np.ndarray  # (K, Q)
+    shifts: np.ndarray  # (K, N) per standard deviation of each deviation
+    channel: np.ndarray  # (K,) index into CHANNELS
+    unit: np.ndarray  # (K,) of the shares of model error
+    trial: np.ndarray  # (K,) source
+    move: np.ndarray  # (K,) source
+    slope: np.ndarray  # (K,) whether a slope over the give, with the shares of the mean, rather than a mean
+    free_mean: np.ndarray  # (num_trials, 4) forces in free motion
+    free_variance: np.ndarray  # (num_trials, 4)
+    free_shifts: np.ndarray  # (num_trials, 4, N)
+    scale_count: np.ndarray  # (3,) samples behind each noise variance
+    # (3,) by channel, the error common to all slopes and that of each
+    slope_sd: np.ndarray = field(default_factory=lambda: np.full(len(observations.CHANNELS), SLOPE_SD))
+    unexpected: tuple[Nuisance, ...] = ()  # force biases that free motion shows and the rig does not admit
     doubts: Mapping[str, PadDoubt] = field(
-        default_factory=lambda: {"normal": PadDoubt(), "shear": PadDoubt()}
+        default_factory=lambda: dict.fromkeys(("normal", "shear"), PadDoubt())
     )
-    level_rises: dict[int, float] = field(default_factory=dict)
+    level_rises: dict[int, float] = field(default_factory=dict)  # [m] mean, of moves between equal heights
+    # (4,) [N] how far the forces' zeros move within a trial
     moved: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
     @property
@@ -511,7 +445,7 @@ class Design:
 
     def repeats(self) -> np.ndarray:
         """By channel (3,): number of means in excess of the unknowns, which determine the scatter."""
-        counts = np.bincount(self.channel[~self.slope], minlength=len(CHANNELS))
+        counts = np.bincount(self.channel[~self.slope], minlength=len(observations.CHANNELS))
         return counts - np.bincount([PROPERTIES.index(u.prop) for u in self.unknowns], minlength=3)
 
 
@@ -524,7 +458,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     raw = np.stack([observe(a.signals, a, rig, moves) for a in weighed])  # T, S, M, 3
     variance = np.stack([sampling_variance(a, noise, moves) for a in weighed])
     factor = np.stack(
-        [[a.grips[m]["force"] @ gravity_factor(a.signals, rig) for m in moves] for a in weighed]
+        [[a.grips[m]["force"] @ observations.gravity_factor(a.signals, rig) for m in moves] for a in weighed]
     )
     valid = np.isfinite(raw) & np.isfinite(variance)
     there = valid.mean(axis=1) > 0.5  # of the alignments
@@ -540,9 +474,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
     slopes = np.stack([observe_slopes(a.signals, a, rig, moves) for a in weighed])  # T, M, K
     sloped = np.array([channel for channel, _ in SLOPES.values()])
     slopes[..., ~there.any(axis=(0, 1))[sloped]] = np.nan  # channels that determine no unknown
-    slope_variance, alike = (
-        np.stack(each) for each in zip(*(slope_variances(a, moves) for a in weighed), strict=True)
-    )
+    slope_variance, alike = map(np.stack, zip(*(slope_variances(a, moves) for a in weighed), strict=True))
     doubts = pad_doubts(slopes, slope_variance, alike, weighed, rig)
     slope_sd = np.array([SLOPE_SD, *(doubt.slope_sd for doubt in doubts.values())])
     slope_variance += slope_sd[sloped] ** 2
@@ -557,7 +489,7 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
             read, per = thin(deviation.read(trial, rig, deviation.step), rate), deviation.sd / deviation.step
             shifts[i, ..., j] = np.nan_to_num(raw[i] - observe(read, a, rig, moves)).mean(axis=0) * per
             slope_shifts[i, ..., j] = np.nan_to_num(slopes[i] - observe_slopes(read, a, rig, moves)) * per
-            free_shifts[i, :, j] = (free_mean[i] - free_forces(read, a)) * per
+            free_shifts[i, :, j] = (free_mean[i] - observations.free_forces(read, a)) * per
     where, steep = np.nonzero(there), np.nonzero(np.isfinite(slopes))
     mean, spread, rows = _combined(raw, variance, valid, coefficients, where)
     rows = np.concatenate([rows, np.zeros((steep[0].size, len(unknowns)))])
@@ -580,12 +512,9 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
 def _combined(
     raw: np.ndarray, variance: np.ndarray, valid: np.ndarray, coefficients: np.ndarray, where: tuple
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means, variances (K,) and coefficients (K, Q) of the observations, drawn alignments combined.
-
-    Alignments are imputations, so the variance is that within one alignment plus 1 + 1 / S times that between
-    them (Rubin 1987, Multiple Imputation, equation 3.1.5). Differences that follow from the coefficients of a
-    longer or shorter span do not count as variation between alignments.
-    """
+    """Means, variances (K,) and coefficients (K, Q) of the observations. Drawn alignments are imputations:
+    their variance is that within one plus 1 + 1 / S times that between them (Rubin 1987, equation 3.1.5),
+    without what follows from the coefficients of a longer or shorter span."""
     used = np.moveaxis(valid, 1, -1)[where]  # K, S
     num = used.sum(axis=1)
 

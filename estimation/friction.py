@@ -6,8 +6,6 @@ slips (`slip_evidence`) is at the limit, so the bound then equals mu. If a block
 its friction against the support (`ground_friction`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
@@ -40,10 +38,8 @@ def ground_friction(
     weight: np.ndarray | None, rng: np.random.Generator,
 ) -> GroundFriction | None:  # fmt: skip
     """Friction of a block on the support it is slid on; None if it is not slid, or the data are insufficient.
-
     The law d fx = mu (W - fy) + W d a / g is linear in mu if `weight`, draws (num_draws,) of W [N], is given,
-    and in mu W, mu and W otherwise. If a task slides the block on several supports, the last one counts.
-    """
+    and in mu W, mu and W otherwise. If a task slides the block on several supports, the last one counts."""
     slid = [s for s in steps if s.object == obj and s.state == SLIDING and s.move is not None]
     if not slid:
         return None
@@ -96,20 +92,15 @@ NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
 
 @dataclass(frozen=True)
 class Stretch:
-    """One finger on one resting block, arrays (num_samples,).
+    """One finger on one resting block, arrays (num_samples,)."""
 
-    `t` [s], `anchor` [m] (height less nominal shear deflection) and its noise `sd` [m], `shear` [N], signed
-    `ratio` of shear to normal force and its noise `ratio_sd`; `compliance` [m/N]: standard deviation of the
-    pad's compliance error.
-    """
-
-    t: np.ndarray
-    anchor: np.ndarray
-    sd: np.ndarray
-    shear: np.ndarray
-    ratio: np.ndarray
+    t: np.ndarray  # [s]
+    anchor: np.ndarray  # [m] height less nominal shear deflection
+    sd: np.ndarray  # [m] its noise
+    shear: np.ndarray  # [N]
+    ratio: np.ndarray  # of shear to normal force, signed
     ratio_sd: np.ndarray
-    compliance: float
+    compliance: float  # [m/N] standard deviation of the pad's compliance error
 
 
 @dataclass(frozen=True)
@@ -124,14 +115,16 @@ class SlipEvidence:
 def slip_evidence(
     stretches: Sequence[Stretch], others: Sequence[Stretch], bound_draws: np.ndarray
 ) -> SlipEvidence:
-    """Evidence for slip in one block's grips, whose coefficient is its bound: draws (num_draws,).
-
-    `others`: stretches with other blocks, which show the drift of anchors without slip.
-    """
+    """Evidence for slip in one block's grips, of this bound (num_draws,); `others` show usual drift."""
     stretches = [s for s in stretches if s.t.size > 2]
     if not stretches:
         return SlipEvidence(PRIOR, 0.0, False)
-    every = _rescaled([*stretches, *(s for s in others if s.t.size > 2)])
+    every = [*stretches, *(s for s in others if s.t.size > 2)]
+    if bends := [np.diff(s.anchor, 2) / s.sd[1:-1] for s in every if s.t.size > 3]:
+        shown = robust_sd(np.concatenate(bends)) / np.sqrt(
+            6.0
+        )  # more than the stated noise of anchors, maybe
+        every = [replace(s, sd=s.sd * max(shown, 1.0)) for s in every]
     own = every[: len(stretches)]
     stray = np.array([_log_density(s, STRAY_DRIFT) for s in every]) + np.log(STRAY)
     still = np.array([[_log_density(s, drift) for s in every] for drift in DRIFTS]) + np.log(1 - STRAY)
@@ -150,15 +143,6 @@ def slip_evidence(
     odds = factor + np.log(PRIOR / (1 - PRIOR))
     probability = float(1 / (1 + np.exp(-np.clip(odds, -700, 700))))
     return SlipEvidence(probability, factor, probability > CERTAIN)
-
-
-def _rescaled(stretches: list[Stretch]) -> list[Stretch]:
-    """Raise anchor noise to the level shown by second differences, if the stated noise is too small."""
-    bends = [np.diff(s.anchor, 2) / s.sd[1:-1] for s in stretches if s.t.size > 3]
-    if not bends:
-        return stretches
-    shown = robust_sd(np.concatenate(bends)) / np.sqrt(6.0)
-    return [replace(s, sd=s.sd * max(shown, 1.0)) for s in stretches]
 
 
 def _near(s: Stretch, coefficient: float) -> np.ndarray:
@@ -200,8 +184,7 @@ def largest_ratio(
 
     `ratio`, `sd` (num_samples,): measured absolute ratios and their noise; `held` (num_alignments,
     num_samples): under which drawn alignments each sample counts. Alignments are marginalised in the maximum;
-    G is learned from the samples of all of them.
-    """
+    G is learned from the samples of all of them."""
     end = float(np.max(ratio + REACH * sd))
     edges = np.linspace(0.0, end, int(np.clip(BINS_PER_SD * end / sd.min(), 20, MAX_BINS)) + 1)
     centres = (edges[1:] + edges[:-1]) / 2
@@ -240,10 +223,7 @@ def largest_ratio(
 
 
 def _moved(bins: np.ndarray, log_likelihood: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Samples in each bin (num_bins,) after redrawing the location of every atom with its samples.
-
-    Without this step an atom with many samples would never leave its bin.
-    """
+    """Samples in each bin (num_bins,) after every atom was redrawn with its samples, lest it never leave."""
     atoms, member = np.unique(bins, return_inverse=True)
     joint = np.zeros((atoms.size, log_likelihood.shape[1]))
     np.add.at(joint, member, log_likelihood)
@@ -257,19 +237,14 @@ DRAWS = 2000  # numerics: of each coefficient
 
 @dataclass(frozen=True)
 class FrictionPosterior:
-    """Friction coefficient of the fingers on one block.
+    """Friction coefficient of the fingers on one block."""
 
-    `lower_bound`: 5 % quantile of `bound_draws` (num_draws,), the posterior of the largest ratio; None with a
-    `reason` if the block was not held. `mu_draws` (num_draws,) only if slip was seen, otherwise `reason`
-    tells why there is no value. `ground`: friction of the block on its support, if it was slid.
-    """
-
-    lower_bound: float | None
-    bound_draws: np.ndarray | None = None
-    mu_draws: np.ndarray | None = None
+    lower_bound: float | None  # 5 % quantile of `bound_draws`; None if the block was not held
+    bound_draws: np.ndarray | None = None  # (num_draws,) of the largest ratio
+    mu_draws: np.ndarray | None = None  # (num_draws,) only if slip was seen
     slip: SlipEvidence | None = None
-    reason: str | None = None
-    ground: GroundFriction | None = None
+    reason: str | None = None  # why there is no value, or no bound
+    ground: GroundFriction | None = None  # of the block on its support, if it was slid
 
     def to_json(self) -> dict:
         """The entry `friction` of one block in the JSON of `identify`."""
@@ -297,11 +272,7 @@ def friction_posteriors(
     weighed: Sequence[WeighedTrial], task: BlockTask, rig: Rig, sd_force: float,
     rng: np.random.Generator, weights: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, FrictionPosterior]:  # fmt: skip
-    """Friction of every object of the task, all trials pooled, alignments marginalised.
-
-    `sd_force`: noise of one force sample [N] if the signals do not state it; `weights`: posterior draws of
-    objects' weights [N].
-    """
+    """Friction of every object, alignments marginalised; `sd_force`: of a sample [N] if unstated."""
     steps = subtasks(task)
     fingers = [[_forces(a, rig, finger, sd_force) for finger in (1, 2)] for a in weighed]
     held = {obj: _held(weighed, fingers, steps, obj) for obj in task.objects}
@@ -327,10 +298,7 @@ def friction_posteriors(
 
 
 def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
-    """Forces of one finger less their mean in free motion, where they should vanish.
-
-    Variation in free motion beyond the sensors' noise (a cable that pulls) counts as noise.
-    """
+    """Forces of one finger less their mean in free motion, whose variation beyond noise counts as noise."""
     free, stated = a.free > 0, a.signals.sd_force
     stated = stated if np.isfinite(stated) else sd_force
     centred, sds = [], []
@@ -350,11 +318,8 @@ def _forces(a: WeighedTrial, rig: Rig, finger: int, sd_force: float) -> _Forces:
 
 
 def _firm(forces: _Forces, holding: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) at which the finger presses firmly; `holding` under each alignment.
-
-    While a pad closes or opens, its damping adds shear that Coulomb's law does not bound, and the ratio of
-    two small forces is uninformative.
-    """
+    """Samples (num_timesteps,) at which the finger presses firmly, `holding` under each alignment: while a
+    pad closes or opens, its damping adds shear that Coulomb's law does not bound."""
     recorded = np.isfinite(forces.normal + forces.shear)
     core = (holding.mean(axis=0) > 0.5) & recorded
     if not core.any():
@@ -390,12 +355,9 @@ def _held(
 
 
 def _stretches(
-    weighed: Sequence[WeighedTrial],
-    fingers: list[list[_Forces]],
-    steps: tuple[Subtask, ...],
-    obj: str,
+    weighed: Sequence[WeighedTrial], fingers: list[list[_Forces]], steps: tuple[Subtask, ...], obj: str,
     rig: Rig,
-) -> list[Stretch]:
+) -> list[Stretch]:  # fmt: skip
     """Each finger on the resting block, with the samples that all alignments share."""
     compliance = 1 / rig.fingertip.shear_stiffness
     out = []

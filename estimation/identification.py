@@ -1,24 +1,12 @@
 """Block properties from aligned trials: posterior, friction and checks, in one result."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from estimation.checks import (
-    PredictiveCheck,
-    check,
-    dense,
-    misfits,
-    soft_pads,
-    unchecked,
-    unnamed,
-    unrepeated,
-    unstated_pads,
-)
+from estimation import checks
 from estimation.consistency import contradictions, force_scale
 from estimation.design import Design, Unknown, build, without_drift, zero_drift
 from estimation.friction import FrictionPosterior, friction_posteriors
@@ -61,7 +49,7 @@ class Identification(Tabled):
     sampled: Draws | None
     friction: dict[str, FrictionPosterior]
     reasons: dict[str, str]
-    predictive: PredictiveCheck | None
+    predictive: checks.PredictiveCheck | None
     warnings: tuple[str, ...]
     notes: tuple[str, ...] = ()
     centres: Mapping[tuple[str, str], float] = field(default_factory=dict)
@@ -104,8 +92,7 @@ class Identification(Tabled):
         friction = {obj: self.friction[obj].to_json() if obj in self.friction else None
                     for obj in self.task.objects}  # fmt: skip
         return {
-            "trials": [s.to_json() for s in self.segmentations],
-            "method": "bayes",
+            "trials": [s.to_json() for s in self.segmentations], "method": "bayes",
             "sampler": None if draws is None else {
                 "walkers": draws.chain.shape[0], "steps": draws.steps, "ess": draws.ess, "rhat": draws.rhat,
                 "acceptance": draws.acceptance, "converged": draws.converged,
@@ -183,11 +170,11 @@ def identify_aligned(
     friction = _friction(aligned, weighed, design, sampled, rng)
     reasons = _reasons(aligned, design, friction)
     predictive, contradicted, centres, kept = None, {}, {}, list[int]()
-    warnings, notes = misfits(aligned), list[str]()
+    warnings, notes = checks.misfits(aligned), list[str]()
     if post is not None and sampled is not None and sampled.converged:
-        predictive = check(post, sampled, rng)
+        predictive = checks.check(post, sampled, rng)
         warnings += predictive.warnings
-        notes = [*unrepeated(design), *unstated_pads(design), *unchecked(design, rig)]
+        notes = [*checks.unrepeated(design), *checks.unstated_pads(design), *checks.unchecked(design, rig)]
         contradicted = contradictions(aligned, weighed, design)
         rejected = contradicted | impossible(design, sampled)
         reasons |= rejected
@@ -219,7 +206,7 @@ def identify_aligned(
     warnings += [f"the zero of {name} {text.format(size)}" for text, sizes in (drifts, moves)
                  for name, size in zip(FORCE_CHANNELS, sizes, strict=True) if size > 0]  # fmt: skip
     warnings += dict.fromkeys(contradicted.values())
-    warnings += [*soft_pads(design, rig), *unnamed(task, design), *dense(task, rig, means)]
+    warnings += checks.soft_pads(design, rig) + checks.unnamed(task, design) + checks.dense(task, rig, means)
     friction = {
         k: f for k, f in friction.items() if f.lower_bound is not None and f"{k}.friction" not in reasons
     }
@@ -258,10 +245,7 @@ def impossible(design: Design, sampled: Draws) -> dict[str, str]:
 
 
 def source_subtasks(described: Decomposition, obj: str, prop: str) -> list[str]:
-    """Names of the subtasks whose samples determine this property, such as `carry block1`.
-
-    A weight is not taken from a slide, which shows it only under a condition.
-    """
+    """Names of the subtasks whose samples determine this property, as `carry block1`."""
     evidence = [e for e in described.properties[obj][prop].evidence if e.condition is None]
     return list(dict.fromkeys(described.subtasks[k].label for one in evidence for k in one.subtasks))
 
@@ -288,8 +272,6 @@ def _not_recorded(aligned: AlignedTrials, obj: str, needed: list[str]) -> str:
     if not needed:
         return f"no subtask of this task lifts {obj}"
     missing = f"the recording does not show {' and '.join(needed)} as the task has it"
-    faults = [
-        f"{t.trial.file}: {fault.line}" for t in aligned.trials for fault in t.trial.faults if fault.spans
-    ]
+    faults = [f"{t.trial.file}: {f.line}" for t in aligned.trials for f in t.trial.faults if f.spans]
     more = f" and {len(faults) - LISTED} more" if len(faults) > LISTED else ""
     return missing + (f" ({'; '.join(faults[:LISTED])}{more})" if faults else "")

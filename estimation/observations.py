@@ -12,8 +12,6 @@ grips, with the integrated autocorrelation time of the residuals (Huber 1964; So
 Each drawn alignment assigns every sample to one subtask.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -39,21 +37,14 @@ STATED = 4.0  # prior: samples that a stated noise is worth: it is off by a fact
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of one effective sample, and the number of samples that it was estimated from.
-
-    By the kind of mean of a grip ("force", "distance", "pickup", "place"), and by force channel in free
-    motion.
-    """
+    """Variance of one effective sample, by kind of mean (KEYS) and of each force in free motion."""
 
     variance: dict[str, float]
-    count: dict[str, float]
+    count: dict[str, float]  # samples that it was estimated from
 
 
 def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str, float]:
-    """Nominal noise of one sample behind each mean [N, m], the median over samples; NaN if unstated.
-
-    Empty for a sensor in the wrist, whose fingers are virtual.
-    """
+    """Nominal noise of one sample behind each mean [N, m], NaN if unstated; none for a wrist's sensor."""
     pads, out = pads_of(aligned.rig), dict[str, float]()
     if any(one.trial.inertia is not None for one in aligned.trials):
         return out
@@ -67,10 +58,7 @@ def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str,
 
 
 def estimated_noise(pooled: dict[str, list], scales: dict[str, float], stated: dict[str, float]) -> Noise:
-    """Noise of each channel from residuals and their weights, pooled over grips.
-
-    `stated`: standard deviations of one sample, where known.
-    """
+    """Noise of each channel from residuals and weights, pooled over grips; `stated`: sds where known."""
     variance, count = {}, {}
     for key, pairs in pooled.items():
         pairs = [(r[np.isfinite(r)], w[np.isfinite(r)]) for r, w in pairs]
@@ -95,13 +83,9 @@ def estimated_noise(pooled: dict[str, list], scales: dict[str, float], stated: d
 
 
 def autocorrelation_time(series: list[np.ndarray]) -> float:
-    """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH.
-
-    Geyer's (1992) initial positive sequence: -1 + 2 times the sum of autocorrelations in pairs of lags (0,
-    1), (2, 3), ... up to the first pair that is not positive. Below 1 if successive residuals cancel, as in
-    differentiated noise. Autocorrelations of series about their own mean are biased by -1 / length, which is
-    corrected.
-    """
+    """Integrated autocorrelation time of residual series, pooled; at least MIN_STRETCH: Geyer's (1992)
+    initial positive sequence, below 1 if successive residuals cancel. Autocorrelations about a series' own
+    mean are biased by -1 / length, which is corrected."""
     power, size = sum(float(r @ r) for r in series), sum(r.size for r in series)
     bias = len(series) / max(size, 1)
 
@@ -162,10 +146,8 @@ def gravity_factor(signals: Signals, rig: Rig) -> np.ndarray:
 def subtask_masks(
     times: np.ndarray, boundaries: np.ndarray, num_subtasks: int, reach: float = 0.0
 ) -> np.ndarray:
-    """Booleans (num_alignments, num_subtasks, num_timesteps): which subtask each sample is in.
-
-    A mean over samples up to `reach` [s] to either side, across a boundary, is in none.
-    """
+    """Booleans (num_alignments, num_subtasks, num_timesteps): which subtask each sample is in. A mean over
+    samples up to `reach` [s] to either side, across a boundary, is in none."""
     first, last = ((at[None, :, None] >= boundaries[:, None, :]).sum(axis=2)
                    for at in (times - reach, times + reach))  # fmt: skip
     return np.where(first == last, first, -1)[:, None, :] == np.arange(num_subtasks)[None, :, None]
@@ -180,10 +162,7 @@ def _members(steps: tuple[Subtask, ...], move: int) -> dict[str, list[int]]:
 
 
 def held_as_described(present: np.ndarray, steps: tuple[Subtask, ...]) -> np.ndarray:
-    """Which of the subtasks shown (num_subtasks,) have samples that determine properties.
-
-    A grip without its carry may hold anything.
-    """
+    """Which subtasks shown (num_subtasks,) determine properties: not those of a grip without its carry."""
     out = present.copy()
     for carry in steps:
         if carry.state == ABOVE_GROUND and not present[carry.index]:
@@ -209,25 +188,20 @@ def robust_weights(
 
 @dataclass(frozen=True, repr=False)
 class WeighedTrial(Brief):
-    """One trial thinned for estimation: its `signals`, and sample weights of each grip's means.
-
-    `masks` (num_alignments, num_subtasks, num_timesteps): samples of the subtasks in drawn alignments.
-    `grips[m]` maps "force", "distance", "pickup" and "place" to weights (num_alignments, num_timesteps) that
-    sum to 1 over the samples (all 0: nothing recorded), `counts[m]` to effective sample numbers
-    (num_alignments,); `free`: weights (num_timesteps,) over free motion, of `free_count` samples;
-    `free_robust` (4, num_timesteps): those of each force, robust to a finger that touches early. `slopes[m]`
-    maps "distance" and "rise" to slopes over the pads' give within the grip, and "landing" to that of heights
-    from the touch to the place, where seen. `rounding` (4,): error of each force that no average removes [N].
-    """
+    """One trial thinned for estimation: its `signals`, and sample weights of each grip's means."""
 
     signals: Signals
-    masks: np.ndarray
+    masks: np.ndarray  # (num_alignments, num_subtasks, num_timesteps) samples in drawn alignments
+    # by move and KEYS weights (num_alignments, num_timesteps), 0 where nothing was recorded
     grips: dict[int, dict[str, np.ndarray]]
-    counts: dict[int, dict[str, np.ndarray]]
-    free: np.ndarray
+    counts: dict[int, dict[str, np.ndarray]]  # likewise effective sample numbers (num_alignments,)
+    free: np.ndarray  # weights (num_timesteps,) over free motion
+    # (4, num_timesteps) the same of each force, robust to a finger that touches early
     free_robust: np.ndarray
-    free_count: float
+    free_count: float  # samples of free motion
+    # by move over the pads' give: "distance" and "rise" within the grip, and "landing" from touch to place
     slopes: dict[int, dict[str, Slope]] = field(default_factory=dict)
+    # (4,) [N] error of each force that no average removes
     rounding: np.ndarray = field(default_factory=lambda: np.zeros(len(FORCE_CHANNELS)))
 
 
@@ -293,10 +267,7 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
 
 
 def _free_samples(s: Signals, free: np.ndarray) -> np.ndarray:
-    """Samples (num_timesteps,) of `free` motion with all forces, apart from contact changes.
-
-    Next to a change one finger may touch alone, or the sample already be in contact.
-    """
+    """Samples (num_timesteps,) of `free` motion with all forces, apart from changes of contact."""
     free = free & np.isfinite(s.fx1 + s.fy1 + s.fx2 + s.fy2)
     margin = 1 + int(np.ceil(APART / float(np.median(np.diff(s.t)))))
     return free & (np.convolve(~free, np.ones(2 * margin + 1), "same") == 0)
@@ -309,10 +280,7 @@ def free_forces(signals: Signals, weighed: WeighedTrial) -> np.ndarray:
 
 
 def _scale(trials: list[tuple[np.ndarray, np.ndarray]], groups: list[list[int]]) -> float:
-    """Robust scale of one channel's residuals, pooled over grips, each of a group of subtasks.
-
-    `trials`: readings (num_timesteps,) and subtask masks (num_subtasks, num_timesteps).
-    """
+    """Robust scale of one channel's residuals, pooled over grips, of readings and subtask masks."""
     residuals = []
     for reading, best in trials:
         for indices in groups:

@@ -8,8 +8,6 @@ well. A landing, in which the load passes from fingers to ground within a few sa
 once more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -36,10 +34,7 @@ SLOPE_SD = 0.1
 
 @dataclass(frozen=True, repr=False)
 class Slope(Brief):
-    """A slope over the give as a weighted sum of readings: weights (num_timesteps,), and its variance.
-
-    `alike`: error common to all slopes of a hand (part of `variance`).
-    """
+    """A slope over the give as a weighted sum of readings (num_timesteps,); `alike`: common error of all."""
 
     weights: np.ndarray
     variance: float
@@ -77,8 +72,7 @@ def slope(
     `place`: the reading from positions alone, which grows with the give; `reading`: the same with the nominal
     give. The rate of the give is fitted as well, to absorb viscosity of the pad, or delay of the force. `t`
     [s]; `noise`: least sd of one reading; `sds`: known sensor noise of a give and of a place [m]. None for
-    too few samples.
-    """
+    too few samples."""
     rate = np.gradient(give, t)
     groups = [g & np.isfinite(reading) & np.isfinite(give) & np.isfinite(rate) for g in groups]
     groups = [g for g in groups if g.sum() >= MIN_SAMPLES]
@@ -118,11 +112,8 @@ def slope(
 def _between(
     give: np.ndarray, place: np.ndarray, trust: np.ndarray, sds: tuple[float, float], fitted: int
 ) -> tuple[np.ndarray, float]:
-    """Sample weights (num_timesteps,) of the slope between those that noise allows, and its doubt.
-
-    Ringing forces flatten the slope over their give, errors of places steepen it
-    (`hmmseg.errors_in_variables`).
-    """
+    """Sample weights (num_timesteps,) of the slope between those that noise allows, and its doubt. Ringing
+    forces flatten the slope over their give, errors of places steepen it (`hmmseg.errors_in_variables`)."""
     count = float(trust.sum()) * max(1 - fitted / max(np.count_nonzero(trust), 1), 0.0)
     both = float(trust @ (give * place))
     square_give, square_place = float(trust @ give**2), float(trust @ place**2)
@@ -192,8 +183,7 @@ def landing(
     `noise`: sd of one reading [m]. None for too few samples.
 
     The height at the touch is extrapolated by a parabola through the last samples before it. Its error is the
-    distance to a straight-line extrapolation, or the curvature between the last samples if that is larger.
-    """
+    distance to a straight-line extrapolation, or the curvature between the last samples if that is larger."""
     moment, moment_sd = touch
     usable = np.isfinite(reading) & np.isfinite(give)
     before = np.flatnonzero(carry & usable & (t <= moment))[-BEFORE:]
@@ -219,11 +209,9 @@ def slopes_within(
     signals: Signals, values: Mapping[str, np.ndarray], groups: Mapping[str, np.ndarray],
     scales: Mapping[str, float], rig: Rig,
 ) -> dict[str, Slope]:  # fmt: skip
-    """Slopes of the readings of width and height over the pads' give, within one grip.
-
-    `values`: readings (num_timesteps,) by name; `groups`: booleans (num_timesteps,) of the samples while the
-    block is held ("distance"), before it is lifted ("pickup") and after it is set down ("place").
-    """
+    """Slopes of the readings of width and height over the pads' give, within one grip. `values`: readings
+    (num_timesteps,) by name; `groups`: booleans (num_timesteps,) of the samples while the block is held
+    ("distance"), before it is lifted ("pickup") and after it is set down ("place")."""
     out = {}
     held = {name: closed(signals, group) for name, group in groups.items()}
     root2, pads = np.sqrt(2.0), unit_pads(rig)

@@ -12,8 +12,6 @@ averaged. The standard deviation is that of the samples (Table 4's), the standar
 independent samples; the effects of autocorrelation, inertia and pads are not included.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -63,26 +61,12 @@ class _Trial:
 
 
 def estimate_plugin(
-    trials_signals: Sequence[Signals],
-    segmentations: Sequence[Segmentation],
-    task: BlockTask,
+    trials_signals: Sequence[Signals], segmentations: Sequence[Segmentation], task: BlockTask,
     states: Sequence[StateLabels] | None = None,
-) -> tuple[Properties, dict[str, str]]:
-    """The paper's estimates of every object of a task from its segmented trials.
-
-    Args:
-        trials_signals: one per trial.
-        segmentations: one per trial.
-        task: of all trials.
-        states: contact states of each trial's samples; by default those of the paper's thresholds.
-
-    Returns:
-        Every property's entry in identify's JSON, with its `standard_error` and normal intervals; and the
-        reason for each missing one, by `object.property`.
-
-    Raises:
-        ValueError: the sequences differ in length.
-    """
+) -> tuple[Properties, dict[str, str]]:  # fmt: skip
+    """The paper's estimates of every object of a task from segmented trials: entries as in identify's JSON
+    with `standard_error` and normal intervals, and the reason for each missing one by `object.property`.
+    `states`: contact states of each trial's samples, by default those of the paper's thresholds."""
     labels = [label_states(s) for s in trials_signals] if states is None else states
     task = _as_performed(task, segmentations)
     steps = subtasks(task)
@@ -154,10 +138,7 @@ def _pooled(key: str, estimates: Sequence[Estimate]) -> dict[str, Any] | None:
 def _heights(
     trials: Sequence[_Trial], task: BlockTask, steps: tuple[Subtask, ...]
 ) -> dict[str, list[Estimate]]:
-    """Height of every object in each trial that determines it, by least squares.
-
-    Means are assumed independent; heights are absolute values, as in Table 3.
-    """
+    """Height of every object (absolute, as in Table 3) in each trial that determines it, by least squares."""
     heights: dict[str, list[Estimate]] = {name: [] for name in task.objects}
     for trial in trials:
         rows, rises, labels = [], [], []

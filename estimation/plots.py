@@ -1,7 +1,5 @@
 """Figures of an identification: corner plot, estimates against measurements, and predicted signals."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,15 +24,12 @@ from hmmseg.segmentation.spans import Segmentation
 
 @dataclass(frozen=True)
 class Prediction:
-    """A recorded signal minus its prediction, and the predictive band of a new sample, (num_timesteps,).
-
-    `low` and `high` bound the central 90 % about 0, NaN without a prediction; in units of the `label`.
-    """
+    """A recorded signal minus its prediction, and the predictive band of a new sample, (num_timesteps,)."""
 
     label: str
     observed: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    low: np.ndarray  # of the central 90 % about 0, NaN without a prediction
+    high: np.ndarray  # likewise
 
     @property
     def coverage(self) -> float:
@@ -82,8 +77,7 @@ def draw_corner(
 
     Contours contain 39, 68 and 95 % of the probability, dashed lines are the 2.5, 50 and 97.5 % quantiles.
     Measured values of `actual` are lines; one far outside the draws is omitted and stated in its panel.
-    Returns the axes (num_properties, num_properties); ValueError if draws and names differ in number.
-    """
+    Returns the axes (num_properties, num_properties); ValueError if draws and names differ in number."""
     if draws.ndim != 2 or draws.shape[1] != len(names):
         raise ValueError(f"draws of shape {draws.shape} for {len(names)} names")
     factors = np.array([SHOWN[prop][0] for _, prop in names])
@@ -127,10 +121,8 @@ def draw_estimates(
     properties: Mapping[str, Mapping[str, dict | None]], actual: Actual | None, path: Path | None = None
 ) -> Axes:
     """Plot one row per property: 68 and 95 % interval in % of the measured value, with the numbers.
-
     `properties` is the JSON of `identify`. Without a measured value the row is relative to the estimate
-    itself (open marker); a property that is None or only bounded says so.
-    """
+    itself (open marker); a property that is None or only bounded says so."""
     rows = [(obj, key) for obj, entry in properties.items() for key in ORDER if key in entry]
     with canvas(path, height=1.1 + 0.27 * len(rows)) as figure:
         ax = figure.subplots()
@@ -203,10 +195,8 @@ def _against(measured: tuple[float, float] | None, factor: float) -> str:
 def draw_predictive(
     t: np.ndarray, shown: Sequence[Prediction], path: Path | None, segmentation: Segmentation
 ) -> list[Axes]:
-    """Plot recorded samples at t (num_timesteps,) [s] in predicted 90 % bands, one panel per signal.
-
-    Samples outside their band are marked; each panel states the share inside.
-    """
+    """Plot recorded samples at t (num_timesteps,) [s] in predicted 90 % bands, one panel per signal. Samples
+    outside their band are marked; each panel states the share inside."""
     with canvas(path, height=1.5 + 1.25 * len(shown)) as figure:
         axes = list(np.atleast_1d(figure.subplots(len(shown), 1, sharex=True)))
         for ax, p in zip(axes, shown, strict=True):

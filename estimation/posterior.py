@@ -16,8 +16,6 @@ drawn (`estimation.sampler`). The density of the scales is written once for NumP
 which finds its mode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -38,31 +36,23 @@ FARTHEST = 9.0  # limit: of any scale from its prior median, all logarithms
 class Model(NamedTuple):
     """A design as one linear model with S coefficients b = (q, z, e, f); arrays of NumPy or JAX.
 
-    `residual` (K,) = `matrix` (K, S) b + noise of variance s^2 `variance` (K,) + (k `unit` (K,))^2, rows
-    independent; `of` (3, K): 1 if a row is of a channel. `products` (K, S (S + 1) / 2) of its columns.
-    `precision` (S, S), `gradient` (S,): information on b that does not depend on the scales, from the prior
-    of the deviations and free motion; `shares` (6, S): 1 if a coefficient is a share; `least` (6,): prior
-    variances of the shares if grips do not differ; `scale_sd` (3,): prior sds of log s.
-    """
+    `residual` = `matrix` b + noise of variance s^2 `variance` + (k `unit`)^2, rows independent."""
 
-    residual: Any
-    matrix: Any
-    products: Any
-    variance: Any
-    unit: Any
-    of: Any
-    precision: Any
-    gradient: Any
-    shares: Any
-    least: Any
-    scale_sd: Any
+    residual: Any  # (K,)
+    matrix: Any  # (K, S)
+    products: Any  # (K, S (S + 1) / 2) of the matrix's columns
+    variance: Any  # (K,)
+    unit: Any  # (K,)
+    of: Any  # (3, K): 1 if a row is of a channel
+    precision: Any  # (S, S) of b from the prior of deviations and free motion, whatever the scales
+    gradient: Any  # (S,) likewise
+    shares: Any  # (6, S): 1 if a coefficient is a share
+    least: Any  # (6,) prior variances of the shares if grips do not differ
+    scale_sd: Any  # (3,) prior sds of log s
 
 
 def normal_equations(theta: Any, model: Model, xp: ModuleType = np) -> tuple[Any, Any, Any]:
-    """Precision (W, S, S) of b given scales theta (W, 6), precision times mean, and the rest of the density.
-
-    Precision times mean is (W, S); the log density (W,), up to a constant, is that of the terms without b.
-    """
+    """Precision (W, S, S) of b at theta (W, 6), precision times mean (W, S), log density without b (W,)."""
     share = priors.SCATTER_MEDIAN[None] * xp.exp(theta[:, NUM_CHANNELS:])
     variance = xp.exp(2 * theta[:, :NUM_CHANNELS] @ model.of) * model.variance[None]
     weight = 1 / (variance + (share @ model.of * model.unit[None]) ** 2)
@@ -73,18 +63,14 @@ def normal_equations(theta: Any, model: Model, xp: ModuleType = np) -> tuple[Any
     precision = (weight @ model.products)[:, np.maximum(place, place.T)]
     precision = precision + model.precision[None] + prior[:, :, None] * np.eye(size)[None]
     gradient = (weight * model.residual[None]) @ model.matrix + model.gradient[None]
-    rest = xp.sum(xp.log(weight) - weight * model.residual[None] ** 2, axis=1) - xp.sum(
-        xp.log(common), axis=1
-    )
+    rest = xp.sum(xp.log(weight) - weight * model.residual[None] ** 2, 1) - xp.sum(xp.log(common), 1)
     return precision, gradient, rest / 2
 
 
 def log_density(theta: Any, model: Model, xp: ModuleType = np) -> Any:
-    """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant.
-
-    `xp`: numpy, or jax.numpy if theta and the model are JAX's. -inf beyond FARTHEST, where the priors are
-    negligible and precision would be lost.
-    """
+    """Log posterior density (W,) of scales (W, 6), all else integrated out, up to a constant. `xp`: numpy, or
+    jax.numpy if theta and the model are JAX's. -inf beyond FARTHEST, where the priors are negligible and
+    precision would be lost."""
     near = xp.all(xp.abs(theta) <= FARTHEST, axis=1)
     theta = xp.clip(theta, -FARTHEST, FARTHEST)
     precision, gradient, rest = normal_equations(theta, model, xp)
@@ -124,10 +110,7 @@ BATCH = 256  # numerics: densities at once, to keep memory small
 
 @dataclass(frozen=True)
 class Posterior:
-    """Posterior of a design; scales theta are log s_c (3) and log(k_c / its prior median) (3).
-
-    `reference` (Q,): least-squares solution, subtracted from the unknowns to keep precision.
-    """
+    """Posterior of a design; theta: log s_c, log(k_c / its prior median); `reference` (Q,): least squares."""
 
     design: Design
     reference: np.ndarray
@@ -161,10 +144,7 @@ class Posterior:
         return np.concatenate(parts)
 
     def given(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (W, Q + N + 6) and Cholesky factor of the precision of (q, z, e, f) given scales (W, 6).
-
-        q relative to `reference`.
-        """
+        """Mean (W, Q + N + 6), q relative to `reference`, and Cholesky factor of the precision."""
         precision, gradient, _ = normal_equations(theta, self.model)
         return np.linalg.solve(precision, gradient[..., None])[..., 0], np.linalg.cholesky(precision)
 
@@ -172,9 +152,8 @@ class Posterior:
 def posterior(design: Design) -> Posterior:
     """The posterior of a design that determines at least one unknown."""
     sd = np.sqrt(design.variance)
-    return Posterior(
-        design, np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)[0]
-    )
+    q = np.linalg.lstsq(design.coefficients / sd[:, None], design.mean / sd, rcond=None)[0]
+    return Posterior(design, q)
 
 
 def independent(design: Design) -> tuple[Design, np.ndarray]:
@@ -182,8 +161,7 @@ def independent(design: Design) -> tuple[Design, np.ndarray]:
 
     Their covariance is s^2 D + k^2 B, D diagonal, B = a a' + the slopes' own, where a is the unit for the
     mean and 1 for slopes: the eigenvectors of D^-1/2 B D^-1/2 diagonalise both for all s and k. The new rows
-    have the variance of a grip's first row.
-    """
+    have the variance of a grip's first row."""
     d = design
     lever = np.where(d.slope, 1.0, d.unit)
     levers = np.stack([lever, np.where(d.slope, 1.0, 0.0)], axis=1)
@@ -216,10 +194,7 @@ STARTS = np.arange(-1.0, 9.0, 1.0)  # numerics: log(share / prior median); a lar
 
 @dataclass(frozen=True)
 class Mode:
-    """Mode (6,) of the scales and their covariance (6, 6); unknowns (Q,) there and theirs (Q, Q).
-
-    The covariance of the unknowns is conditional on the scales' mode.
-    """
+    """Mode (6,) of the scales, their covariance (6, 6), unknowns (Q,) there and their own (Q, Q)."""
 
     scales: np.ndarray
     covariance: np.ndarray
@@ -250,10 +225,7 @@ def find_mode(post: Posterior) -> Mode:
 
 @lru_cache
 def _climb() -> Callable[[np.ndarray, Model], Any]:
-    """Map a start (6,) to the nearest maximum (6,) of the density; one compiled program per padded size.
-
-    On the CPU in any case: six scales are not worth a transfer to an accelerator.
-    """
+    """Map a start (6,) to the nearest maximum (6,) of the density, on the CPU; one program a padded size."""
     import jax  # these are slow to import
     import jax.numpy as jnp
     import optimistix

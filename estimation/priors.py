@@ -7,8 +7,6 @@ Model error is a share of the quantity on which each channel's equation rests (`
 carried force, the pads' give along the grip, their shear deflection.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 PROPERTY_MEDIAN = {"weight": 0.5, "width": 0.02, "height": 0.02}  # prior: N, m, m
@@ -20,11 +18,9 @@ COMMON = np.array([5e-4, 1e-3, 0.03])  # prior: sd of the share common to all gr
 
 
 def log_prior(prop: str, coefficients: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Log density (N,), up to a constant, of values (N,) of sum(coefficients * property of an object).
-
-    A sum of independent log-normal variables is approximated by the log-normal of the same first two moments
-    (Fenton 1960), one with differences by the normal. -inf for non-positive values of a positive sum.
-    """
+    """Log density (N,), up to a constant, of values (N,) of sum(coefficients * property of an object). A sum
+    of independent log-normal variables is approximated by the log-normal of the same first two moments
+    (Fenton 1960), one with differences by the normal. -inf for non-positive values of a positive sum."""
     of_one = PROPERTY_LOG_SD[prop] ** 2
     each = PROPERTY_MEDIAN[prop] * np.exp(of_one / 2)
     mean = coefficients.sum() * each

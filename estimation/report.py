@@ -1,7 +1,5 @@
 """Properties as JSON, text and tables, and compared with values measured apart from the trials."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from pathlib import Path
@@ -69,18 +67,9 @@ def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "ac
 
 
 def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0) -> dict[str, Any]:
-    """Compare identified properties with measured values.
-
-    Args:
-        properties: as in identify's JSON.
-        measured: value and standard deviation by object and property.
-        smallest: relative deviation that matters.
-
-    Returns:
-        By object and property: `value`, `sd`, and if the property was identified `relative_deviation`, `z`
-        (in sds of both combined), `inside_95` and `disagrees` (beyond SURE sds and beyond `smallest`). A
-        friction with only a lower bound disagrees if the measured value lies below it.
-    """
+    """By object and property of `measured`: `value`, `sd`, and if identified `relative_deviation`, `z` (in
+    sds of both combined), `inside_95` and `disagrees` (beyond SURE sds and the relative deviation
+    `smallest`). A friction with only a lower bound disagrees if the measured value lies below it."""
     out: dict[str, Any] = {}
     for obj, entries in measured.items():
         for prop, (value, sd) in entries.items():
@@ -145,10 +134,8 @@ def number(value: Any, where: str, expected: str, low: float, high: float) -> fl
 
 def property_rows(body: dict[str, Any], measured: Actual | None = None) -> list[dict[str, str]]:
     """One row per property as text: estimate, intervals, measured value, deviation, and its source.
-
     `deviation`: of the estimate from the measured value in per cent; `from`: the subtasks that determine it,
-    or why it is unknown. What only a combination of properties is determined for comes last.
-    """
+    or why it is unknown. What only a combination of properties is determined for comes last."""
     rows, entries = [], [(o, p, e) for o, own in body["properties"].items() for p, e in own.items()]
     for one in body.get("combinations", ()):
         terms = {key.rpartition(".")[0]: number for key, number in one["of"].items()}

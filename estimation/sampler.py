@@ -6,8 +6,6 @@ walkers that would be stuck in a tail. benchmarks/moves.py of commit f82105c com
 stretch move.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -27,14 +25,11 @@ STEP, REACH = 0.25, (-10.0, 10.0)  # numerics: of the grid, in log(share / its p
 
 @dataclass(frozen=True)
 class Proposal:
-    """Multivariate t of the noise scales, `mean` (3,) and `chol` (3, 3); grid densities of the scatters.
+    """Multivariate t of the noise scales, and grid densities of the scatters."""
 
-    `cells` (3, G): probabilities of the grid's intervals, of width STEP from REACH[0] on.
-    """
-
-    mean: np.ndarray
-    chol: np.ndarray
-    cells: np.ndarray
+    mean: np.ndarray  # (3,)
+    chol: np.ndarray  # (3, 3)
+    cells: np.ndarray  # (3, G) probabilities of the grid's intervals, of width STEP from REACH[0] on
 
     def draw(self, num: int, random: np.random.RandomState) -> np.ndarray:
         """Proposals (num, 6)."""
@@ -94,25 +89,18 @@ MIN_EFFICIENCY = 0.05  # numerics: least effective share of draws after weightin
 
 @dataclass(frozen=True, repr=False)
 class Draws(Brief):
-    """Posterior draws of the scales (walkers, steps, 6) and unknowns (walkers, steps, Q) [N, m].
+    """Posterior draws of the scales and unknowns."""
 
-    `ess`: smallest effective sample size over scales (emcee's autocorrelation time); `rhat`: largest split
-    R-hat over scales, with walkers as chains (Gelman et al. 2013). `shares` (walkers, steps, 6): model error
-    common to all grips; `deviations` (walkers, steps, N) of the hand. `prior_ess`: effective share of draws
-    after weighting by the unknowns' priors. `impossible`: unknowns all of whose draws have an impossible
-    sign.
-    """
-
-    scales: np.ndarray
-    chain: np.ndarray
-    deviations: np.ndarray
-    shares: np.ndarray
-    ess: float
-    rhat: float
+    scales: np.ndarray  # (walkers, steps, 6)
+    chain: np.ndarray  # (walkers, steps, Q) of the unknowns [N, m]
+    deviations: np.ndarray  # (walkers, steps, N) of the hand
+    shares: np.ndarray  # (walkers, steps, 6) model error common to all grips
+    ess: float  # smallest over scales, by emcee's autocorrelation time
+    rhat: float  # largest split R-hat over scales, with walkers as chains (Gelman et al. 2013)
     acceptance: float
     steps: int
-    prior_ess: float
-    impossible: tuple[int, ...] = ()
+    prior_ess: float  # effective share of draws after weighting by the unknowns' priors
+    impossible: tuple[int, ...] = ()  # unknowns all of whose draws have an impossible sign
 
     @property
     def flat(self) -> np.ndarray:
@@ -217,10 +205,8 @@ def _resampled(weight: np.ndarray, random: np.random.RandomState) -> np.ndarray:
 
 
 def effective_sample_size(chain: np.ndarray) -> float:
-    """Smallest effective sample size over parameters of a chain (walkers, steps, dim).
-
-    By emcee's autocorrelation time (Goodman & Weare 2010); 0 if a parameter never moved.
-    """
+    """Smallest effective sample size over parameters of a chain (walkers, steps, dim), by emcee's
+    autocorrelation time (Goodman & Weare 2010); 0 if a parameter never moved."""
     import emcee  # slow to import: it loads scipy.stats
 
     with np.errstate(invalid="ignore"):  # 0 / 0 of a walker that never moved
@@ -230,12 +216,9 @@ def effective_sample_size(chain: np.ndarray) -> float:
 
 
 def split_rhat(chain: np.ndarray) -> float:
-    """Largest split R-hat over parameters of a chain (walkers, steps, dim).
-
-    Walkers are joined into GROUPS chains (one walker alone is too short to have a variance of its own), each
-    halved in time: Gelman et al. 2013, Bayesian Data Analysis, section 11.4. Walkers of an ensemble are not
-    independent, so this only detects drift and stuck groups.
-    """
+    """Largest split R-hat over parameters of a chain (walkers, steps, dim) whose walkers are joined into
+    GROUPS chains, halved in time: Gelman et al. 2013, section 11.4. Walkers of an ensemble are not
+    independent, so this only detects drift and stuck groups."""
     walkers, steps, dim = chain.shape
     half, per_group = steps // 2, walkers // GROUPS
     kept = chain[: GROUPS * per_group, : 2 * half].reshape(GROUPS, per_group, 2, half, dim)

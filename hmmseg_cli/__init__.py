@@ -11,8 +11,7 @@ for _library in ("OMP", "OPENBLAS", "MKL"):
 
 
 def run() -> None:
-    """Run the command line as a process. An interrupt ends it without a traceback from here on, imports
-    included, and changes no exit code once all is written."""
+    """Run the command line as a process, which an interrupt ends without a traceback, whenever it comes."""
     try:
         from hmmseg_cli.main import main
 

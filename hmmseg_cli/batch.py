@@ -4,8 +4,6 @@ The result of a recording depends only on it, its task and its rig, not on the n
 order.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import logging
@@ -39,10 +37,7 @@ class Segmented:
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
-    """The paths, with plain folders replaced by the recordings in them, in the order of their names.
-
-    Recordings in .txt files must be named: in a folder they might be notes.
-    """
+    """The paths, with plain folders replaced by the recordings in them, sorted; .txt files may be notes."""
     out, kinds = list[Path](), [kind for kind in KINDS if kind != ".txt"]
     for path in paths:
         inside = [path]
@@ -80,12 +75,8 @@ def segment_apart(
     paths: Sequence[Path], task: Path, rig: Path, workers: int | None, scheduler: str | None,
     advance: Callable[[int], None], tell: Callable[[str], None],
 ) -> Iterator[Segmented]:  # fmt: skip
-    """Results of `segment_one`, in the order of the paths; `advance` gets the number of further ones done.
-
-    A recording whose worker is lost is segmented again by itself; if that worker is lost too, it is left out
-    with a warning to `tell`. InputError if a recording or the cluster is at fault; the rest is then
-    cancelled.
-    """
+    """Results of `segment_one` in order; `advance` gets the number of further ones done. One whose worker is
+    lost is segmented once more, then left out with a warning to `tell`. InputError for bad recordings."""
     left, lab = list(paths), (task.absolute(), rig.absolute())
     while left:
         with _executor(workers, scheduler) as executor:

@@ -28,6 +28,7 @@ import hmmseg
 from hmmseg.cache import CacheWarning
 from hmmseg.errors import InputError
 from hmmseg.io.formats import KINDS, kind_of, parts_of, split_part
+from hmmseg.io.schema import read_toml
 
 STANDARD_OUTPUT = "-"
 INPUT_SUFFIXES = (*KINDS, ".toml")
@@ -71,11 +72,8 @@ def _write_groups(formatter: Any, rows: Iterable[tuple[str, tuple[str, str] | No
 
 
 class Output:
-    """Destinations of one command's results: the screen, a JSON document, figures and a report.
-
-    A context manager. `print` and `warn` show text, `figure` and `stage` return paths to draw and write to,
-    and `finish` puts everything in place. Raises InputError at once if a destination cannot be written.
-    """
+    """Destinations of one command's results. `figure` and `stage` return paths to write to, and `finish` puts
+    everything in place. InputError at once if one cannot be written."""
 
     def __init__(self, command: str, *, json: str | None = None, figures: Path | None = None,
                  report: Path | None = None, seed: int = 0, quiet: bool = False) -> None:  # fmt: skip
@@ -116,10 +114,7 @@ class Output:
         self._cleanup.close()
 
     def print(self, *renderables: Any, whole: bool = False) -> None:
-        """Show tables or text on standard output, or on standard error if `--json -` takes that.
-
-        `whole`: lines are not wrapped, so that they can be copied.
-        """
+        """Show tables or text, on standard error if `--json -` takes standard output; `whole`: unwrapped."""
         for renderable in renderables:
             with self._console.unless_lost():
                 self._console.print(renderable, highlight=False, markup=False, soft_wrap=whole)
@@ -144,8 +139,7 @@ class Output:
 
     @contextlib.contextmanager
     def progress(self, text: str, total: int) -> Iterator[Callable[..., None]]:
-        """A progress bar on standard error; yields a function that advances it by some steps and may set its
-        text."""
+        """A progress bar on standard error; yields a function that advances it and may set its text."""
         from rich.progress import Progress
 
         with Progress(console=self._side, transient=True, disable=not self._side.is_terminal) as bar:
@@ -170,13 +164,8 @@ class Output:
 
     def finish(self, document: dict[str, Any]) -> None:
         """Write the staged files and the JSON document, with `format`, `version`, ... added."""
-        envelope = {
-            "format": f"hmmseg.{self.command}/1",
-            "version": hmmseg.__version__,
-            "seed": self.seed,
-            "warnings": self.warnings,
-            "figures": [str(path) for path in self._drawn],
-        }
+        envelope = {"format": f"hmmseg.{self.command}/1", "version": hmmseg.__version__, "seed": self.seed,
+                    "warnings": self.warnings, "figures": [str(path) for path in self._drawn]}  # fmt: skip
         text = strict_json({**envelope, **document})
         if self.json not in (None, STANDARD_OUTPUT):
             self.stage(Path(self.json)).write_bytes(text.encode("utf-8", "backslashreplace"))
@@ -208,11 +197,8 @@ def _plain(value: Any) -> Any:
 
 
 def distinct_trials(paths: Sequence[Path]) -> list[Path]:
-    """The trials' paths, `FILE#NAME` for each recording of a file with several.
-
-    InputError if a trial is given twice, even under two names: pooling it with itself would count its noise
-    as independent evidence.
-    """
+    """The trials' paths, `FILE#NAME` for each recording of a file with several; InputError if one is given
+    twice, as its noise would count as independent evidence."""
     seen: dict[str, Path] = {}
     out: list[Path] = []
     for given in paths:
@@ -239,9 +225,7 @@ NO_HAND = MAPS | {"rate", "gravity"}  # keys that describe no hand
 
 def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> tuple[Path, Path | None]:
     """Task and rig of these trials: as given, else task.toml and rig.toml in the folder of the first.
-
-    InputError if there is no task, or if one is given as the other.
-    """
+    InputError if there is no task, or if one is given as the other."""
     folder = split_part(trials[0])[0].parent
     found = [folder / name if given is None and (folder / name).is_file() else given
              for given, name in ((task, "task.toml"), (rig, "rig.toml"))]  # fmt: skip
@@ -252,9 +236,8 @@ def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> 
         found[1] = rig  # needs no hand, and a rig in its folder may be another task's
     if as_task and not as_task & TASK_KEYS and (task is not None or as_rig & TASK_KEYS):
         swapped = f"; are --task and --rig {found[1]} swapped?" if as_rig & TASK_KEYS else ""
-        raise InputError(
-            f"--task {found[0]}", "describes no task", f"objects and moves, or a sequence{swapped}"
-        )
+        expected = f"objects and moves, or a sequence{swapped}"
+        raise InputError(f"--task {found[0]}", "describes no task", expected)
     if as_rig & TASK_KEYS:
         raise InputError(f"--rig {found[1]}", "describes a task", "the description of a hand")
     return found[0], found[1]
@@ -263,17 +246,13 @@ def find_inputs(trials: Sequence[Path], task: Path | None, rig: Path | None) -> 
 def require_rig(rig: Path | None, trials: Sequence[Path]) -> Path:
     """The rig of a task of blocks; InputError if there is none."""
     if rig is None:
-        folder = split_part(trials[0])[0].parent
-        raise InputError(
-            "--rig", "missing", f"the nominal hand of a task of blocks, or a rig.toml in {folder}"
-        )
+        expected = f"the nominal hand of a task of blocks, or a rig.toml in {split_part(trials[0])[0].parent}"
+        raise InputError("--rig", "missing", expected)
     return rig
 
 
 def _keys(path: Path | None) -> set[str]:
     """Top-level keys of a TOML file; none if it cannot be read, which its reader reports."""
-    from hmmseg.io.schema import read_toml
-
     try:
         return set() if path is None else set(read_toml(path))
     except InputError:
@@ -286,9 +265,8 @@ def read_trials(out: Output, paths: Sequence[Path], rig: Any = None, task: Any =
 
     found = [read_trial(path, rig, task) for path in paths]
     if rig is not None and rig.effects and out.command != "simulate":
-        out.warn(
-            f"rig.toml's [effects] ({', '.join(rig.effects)}) act in simulate alone; they are left out here"
-        )
+        names = ", ".join(rig.effects)
+        out.warn(f"rig.toml's [effects] ({names}) act in simulate alone; they are left out here")
     for trial in found:
         out.warn(*trial.warnings)
         out.print(*trial.notes)
@@ -305,8 +283,7 @@ def named(where: str) -> Iterator[None]:
 
 
 def check_folder(option: str, folder: Path, shown: Path | None = None) -> None:
-    """InputError, about the folder or what is `shown`, unless files can be written into the folder, which
-    need not exist yet."""
+    """InputError, about the folder or what is `shown`, unless files can be written there; it may be new."""
     existing, where = folder.absolute(), f"{option} {shown or folder}"
     with named(where):
         while not existing.exists():

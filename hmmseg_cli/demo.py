@@ -1,7 +1,5 @@
 """`hmmseg demo`: identify and diagnose recordings that come with the package, figures included."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hmmseg.example import example_folder

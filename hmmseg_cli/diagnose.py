@@ -109,8 +109,7 @@ def refuse(problem: str, given: dict[str, Any]) -> None:
 
 
 def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:
-    """Write the corrected model; only a warning if there is no cause to correct, or if correcting it does not
-    reduce the gap of held-out trials."""
+    """Write the corrected model; only a warning where it would not reduce the gap of held-out trials."""
     from simgap.patch import files
 
     if (folder / "rig.toml").resolve() == rig.resolve():

@@ -47,9 +47,8 @@ def extended(rig_file: Path, found: Sequence[Inspection]) -> str:
     """The rig's text with the mapping added; InputError if it has one already, or none was found."""
     proposed = list(dict.fromkeys(each.toml for each in found if each.toml))
     if not proposed:
-        raise InputError(
-            f"--write {rig_file}", "no mapping was found to propose", "columns named after what they hold"
-        )
+        problem = "no mapping was found to propose"
+        raise InputError(f"--write {rig_file}", problem, "columns named after what they hold")
     if len(proposed) > 1:
         raise InputError(f"--write {rig_file}", "the files need different mappings", "one at a time")
     text = rig_file.read_text(encoding="utf-8") if rig_file.exists() else ""

@@ -6,8 +6,6 @@ Tables (CSV, Parquet) get the columns `subtask_index` (from 0), `subtask`, `obje
 `language_persistent`, as its own tools write them, and the feature `boundary_sd`.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -174,9 +172,7 @@ def lerobot_files(
     folder: Path, labelled: Mapping[int, tuple[Trial, Sequence[Span]]]
 ) -> dict[Path, Callable[[Path], object]]:
     """Files of an annotated copy by their place in its folder, each with a function that writes it to a path.
-
-    Episodes without labels get no subtasks. Videos are not copied.
-    """
+    Episodes without labels get no subtasks. Videos are not copied."""
     from hmmseg.io.formats.lerobot import EVENTS, PERSISTENT, data_files, read_info, read_subtasks
 
     info = read_info(folder)

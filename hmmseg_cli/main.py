@@ -4,8 +4,6 @@
 refuses (memory, a disk). Any other exception is a bug and shows its traceback.
 """
 
-from __future__ import annotations
-
 import _thread
 import contextlib
 import gc
@@ -20,21 +18,7 @@ import typer
 import hmmseg
 from hmmseg.errors import InputError
 from hmmseg.jaxconfig import configure
-from hmmseg_cli import (
-    demo,
-    describe,
-    diagnose,
-    doctor,
-    fit,
-    identify,
-    inspect,
-    play,
-    robot,
-    run,
-    segment,
-    simulate,
-    watch,
-)
+from hmmseg_cli import demo, describe, diagnose, identify, inspect, play, robot, run, segment, simulate, watch
 from hmmseg_cli.console import Grouped, Hmmseg, discard, escape_control
 
 # numerics: objects between two garbage collections: most belong to modules and compilers, and stay anyway
@@ -54,13 +38,13 @@ COMMANDS = {
         inspect.new: "hmmseg new my_hand --from trial_01.csv",
         inspect.inspect: "hmmseg inspect trial_01.csv",
         describe.decompose: "hmmseg decompose task.toml",
-        doctor.doctor: "hmmseg doctor",
+        describe.doctor: "hmmseg doctor",
     },
     "When and what": {
         segment.segment: "hmmseg segment trial_*.csv --figures figures/",
         identify.identify: "hmmseg identify trial_*.csv --report report.html",
         watch.watch: "robot --csv | hmmseg watch --task task.toml --rig rig.toml",
-        fit.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
+        segment.fit: "hmmseg fit trial_*.csv --labels labels/ --model model.npz",
     },
     "Why simulation and recording differ": {
         robot.calibrate: "hmmseg calibrate log_*.csv --mjcf robot.xml --map map.toml --patch corrected/",
@@ -102,10 +86,7 @@ AGAIN = 0.02  # numerics: s until an interrupt is repeated; the callback has usu
 
 @contextlib.contextmanager
 def repeat_interrupts() -> Iterator[None]:
-    """Lose no interrupt, and report none with a traceback.
-
-    A Ctrl-C that arrives while a compiler calls back into Python is dropped there, and repeated here.
-    """
+    """Lose no interrupt: one that arrives while a compiler calls back into Python is repeated here."""
     usual, waiting = sys.unraisablehook, []
 
     def hook(unraisable: Any) -> None:

@@ -1,7 +1,5 @@
 """Arguments and options of all commands: type, flag and line of help."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any

@@ -16,16 +16,7 @@ from estimation.identification import Identification
 from estimation.plots import draw_check, draw_corner, draw_estimates
 from estimation.report import INTERVALS, Actual, property_rows
 from hmmseg.io.trial import Trial
-from hmmseg.numbers import (
-    SHOWN,
-    between,
-    estimate,
-    interval,
-    percent,
-    plain,
-    property_shown_as,
-    shown_as,
-)
+from hmmseg.numbers import SHOWN, between, estimate, interval, percent, plain, property_shown_as, shown_as
 from hmmseg.segmentation.spans import Segmentation
 from simgap.report import finding
 from simgap.report.finding import plain_name
@@ -122,20 +113,17 @@ SHARES = ("gain", "scale", "finger1", "finger2", "fx1", "fy1", "fx2", "fy2")  # 
 
 @dataclass(frozen=True)
 class Setting:
-    """Contents of a page apart from the body.
+    """Contents of a page apart from the body."""
 
-    `files`: recordings; `rig`: its pads; `measured`: independent values of properties; `shows`: signature of
-    each effect; `own`: by part of a robot, the unit in which its logs give a quantity that they do not give
-    in SI; `motion`: place of the motion to run next.
-    """
-
-    files: Sequence[str]
-    rig: Mapping[str, Any] = field(default_factory=dict)
+    files: Sequence[str]  # recordings
+    rig: Mapping[str, Any] = field(default_factory=dict)  # its pads
+    # independent values of properties
     measured: Mapping[str, Mapping[str, tuple[float, float]]] | None = None
-    shows: Mapping[str, str] = field(default_factory=dict)
+    shows: Mapping[str, str] = field(default_factory=dict)  # signature of each effect
     warnings: Sequence[str] = ()
+    # by part of a robot, the unit in which its logs give a quantity
     own: Mapping[str, Own] = field(default_factory=dict)
-    motion: str = ""
+    motion: str = ""  # place of the motion to run next
 
 
 def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], None]) -> str:
@@ -146,29 +134,19 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
     cells, measured = finding.by_place(body), setting.measured
     to_do = [*finding.to_do(body), *filter(None, [finding.settles(body, measured is not None)])]
     return rendered(
-        "diagnose.html.j2",
-        headline=finding.headline(body, setting.rig),
-        lines=finding.sentences(body),
-        to_do=to_do if body["verdict"] != "none" else [],
-        remains=finding.remains(body),
+        "diagnose.html.j2", headline=finding.headline(body, setting.rig), lines=finding.sentences(body),
+        to_do=to_do if body["verdict"] != "none" else [], remains=finding.remains(body),
         parameters=_parameters(effect, body["causes"], setting) if effect and body["causes"] else [],
         where=[_place(key, found) for key, found in list(cells.items())[:MOST]],
         more_cells=max(len(cells) - MOST, 0),
         images=dict.fromkeys(("gap_where", "gap_signal", "gap_before_after")) | images,
-        suspects=_suspects(body, setting),
-        attributed=bool(body.get("attribution")),
-        robot=finding.of_robot(body),
-        compared="changes" in body,
-        motion=setting.motion,
+        suspects=_suspects(body, setting), attributed=bool(body.get("attribution")),
+        robot=finding.of_robot(body), compared="changes" in body, motion=setting.motion,
         calibrated=[(plain_name(n), *_values(n, p, shown_as(p["unit"]), setting)) for n, p in fitted.items()],
-        numerics=_numerics(body),
         properties=_properties(effect, measured) if effect and body["causes"] else [],
-        measured=measured is not None,
-        detection=_detection(body),
-        far=_far(body),
-        warnings=setting.warnings,
-        files=setting.files,
-    )
+        measured=measured is not None, numerics=_numerics(body), detection=_detection(body), far=_far(body),
+        warnings=setting.warnings, files=setting.files,
+    )  # fmt: skip
 
 
 def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
@@ -286,10 +264,8 @@ def _far(body: Body) -> str:
     if "changes" in body:
         rest = f"old ones leave {plain(s['noise_floor'])}"
         return f"On {s['evaluated_on']} what is missed falls {fall} nats a row; {rest}."
-    text = (
-        f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
-        f"healthy recordings leave {plain(s['noise_floor'])}."
-    )
+    text = (f"On {s['evaluated_on']} the mean squared residual falls {fall}; "
+            f"healthy recordings leave {plain(s['noise_floor'])}.")  # fmt: skip
     if s.get("flexible_ceiling") is not None:
         text += f" A description free of any physics would take {percent(s['flexible_ceiling'])} of the gap."
     return text

@@ -66,10 +66,7 @@ async def _serve(out: Output, server: PlayServer, port: int, open_page: bool) ->
 
 
 def diagnosed(path: Path) -> dict[str, dict[str, float]]:
-    """Effects and their values from a diagnosis; none for any other file.
-
-    InputError if it names no cause, or one that cannot be felt.
-    """
+    """Effects and values from a diagnosis, none for other files; InputError if no cause of it can be felt."""
     from simgap.play.world import effect_values, felt_effects
 
     document = read_json(path, "identify's or diagnose's JSON") if path.suffix.lower() == ".json" else {}

@@ -118,10 +118,7 @@ def fitted_effects(
 
 @contextmanager
 def show_stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages, with the position within long ones; yields the callback of each stage.
-
-    InputError if the simulation diverges so far from the logs that no equation can be solved.
-    """
+    """Progress by stages; yields their callback. InputError if the simulation diverges far from the logs."""
     from numpy.linalg import LinAlgError
 
     from simgap.progress import heard
@@ -290,9 +287,8 @@ def _deliver(
         document["history"] = robot.compared(past, now)
         out.print(*_history(document["history"], now))
         today = {"date": date.today().isoformat(), "files": [log.name for log in logs], "parameters": now}
-        lines = "".join(
-            json.dumps(json.loads(strict_json(e)), ensure_ascii=False) + "\n" for e in (*past, today)
-        )
+        runs = (json.loads(strict_json(run)) for run in (*past, today))
+        lines = "".join(json.dumps(run, ensure_ascii=False) + "\n" for run in runs)
         out.stage(own.history).write_text(lines, encoding="utf-8")
     folder = own.patch or out.figures or (out.report.parent if out.report is not None else None)
     motion, place = robot.next_motion(document, logs), None

@@ -31,10 +31,7 @@ def _text(line: bytes) -> str:
 
 
 class Rows:
-    """Rows of a CSV stream as (t, channels in SI units).
-
-    InputError names the column of the header or the row at fault, counted as an editor does.
-    """
+    """Rows of a CSV stream as (t, channels in SI units); InputErrors name columns, and rows as editors do."""
 
     def __init__(self, stream: BinaryIO, watcher: Watcher) -> None:
         self._stream, self._number = stream, 0
@@ -116,8 +113,7 @@ class Rows:
         return bool(units)
 
     def _number_in(self, cells: list[str], i: int) -> float:
-        """A cell that is not a plain number: empty, quoted, with a decimal comma, or an ISO stamp, which
-        becomes s since the first."""
+        """A cell that is empty, quoted, with a decimal comma, or an ISO stamp, in s since the first."""
         text = "" if i < 0 else cells[i].strip().strip('"')
         if not text:
             return math.nan

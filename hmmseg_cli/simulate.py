@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hmmseg.contact.decompose import subtasks
 from hmmseg.errors import InputError
-from hmmseg.io.rig import Rig, read_rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig, read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg.tables import listed
 from hmmseg_cli import options as opt
@@ -60,17 +62,15 @@ def simulate(
         for stem, film in films.items() if animation else ():
             written.append(output / f"{stem}.{animation_format.value}")
             animate(out.stage(written[-1]), *film)
-        shown = {name: {"weight": b.weight, "width": b.width, "height": b.height, "friction": b.friction}
-                 for name, b in blocks.items()}  # fmt: skip
         out.print(f"wrote {len(written)} files into {output}")
-        out.finish({"properties": shown, "files": written, **document})
+        properties_of = {name: asdict(block) for name, block in blocks.items()}
+        out.finish({"properties": properties_of, "files": written, **document})
 
 
 def _perform(
     out: Output, task: BlockTask, rig: Rig, blocks: Blocks, count: int, operator: Path | None
 ) -> tuple[dict[str, str], dict[str, Any], Films]:
-    """Trials by the model's own operator: files by name, their part of the document, and scenes to
-    animate."""
+    """Trials by the model's operator: files by name, their part of the document, and scenes to animate."""
     import numpy as np
 
     from simgap.patch import performed
@@ -99,12 +99,9 @@ def _perform(
 def _replay(
     out: Output, path: Path, task: BlockTask, rig: Rig, blocks: Blocks
 ) -> tuple[dict[str, str], dict[str, Any], Films]:
-    """A recording's motions through the model: files by name, their part of the document, scenes to
-    animate."""
+    """A recording's motions through the model: files, their part of the document, scenes to animate."""
     import numpy as np
 
-    from hmmseg.contact.decompose import subtasks
-    from hmmseg.io.rig import FORCE_CHANNELS
     from hmmseg.io.trial import Trial
     from hmmseg.segmentation.align import segment
     from simgap.patch import replayed

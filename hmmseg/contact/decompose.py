@@ -8,8 +8,6 @@ only unknown, which exact elimination finds without tolerances. Properties that 
 in all moves together, such as the heights in a tower of three.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,21 +27,16 @@ FINGERS = ("finger1", "finger2")
 
 @dataclass(frozen=True)
 class Subtask:
-    """One step of a task, between two changes of the active constraints of the hand and its object.
-
-    `state`: the contact state; the paper calls every support the ground. `move`: 0-based index in
-    `task.performed` of its move (None in a plain ordered task); a pregrasp belongs to the first move, a
-    release to the move it ends. `support`: what the held object touches besides the fingers, None while free
-    or lifted; `beneath`: objects from the support down to the ground.
-    """
+    """One step of a task, between two changes of the active constraints of the hand and its object."""
 
     index: int
     name: str
     object: str | None
-    state: str
+    state: str  # the contact state; every support is called ground, as in the paper
+    # 0-based, in `task.performed`; a pregrasp is of the first, a release of the move it ends
     move: int | None
-    support: str | None = None
-    beneath: tuple[str, ...] = ()
+    support: str | None = None  # what the held object touches besides the fingers
+    beneath: tuple[str, ...] = ()  # objects from the support down to the ground
 
     @property
     def label(self) -> str:
@@ -75,11 +68,7 @@ def stack(support: dict[str, str], name: str) -> tuple[str, ...]:
 
 
 def subtasks(task: AnyTask) -> tuple[Subtask, ...]:
-    """The ordered subtasks of a task.
-
-    In every move of blocks the hand closes on the object, breaks its support contact or slides it, restores
-    contact at the destination, and opens.
-    """
+    """The ordered subtasks of a task: per move of blocks pregrasp, pickup, carry or slide, place, release."""
     if isinstance(task, SequenceTask):
         return tuple(Subtask(i, name, None, name, None) for i, name in enumerate(task.sequence))
     support = dict(task.initial)
@@ -153,8 +142,7 @@ def balance(step: Subtask, loads: int = 1) -> list[Equation]:
     plus that of the grip on it, which is constant throughout one move. Forces: the fingers' net vertical
     force is the weight less the support's load, their net horizontal force is the support's push. Slipping:
     push = friction x load (Coulomb), linearised about given loads; their values are arbitrary, distinct
-    numbers, as only rank matters.
-    """
+    numbers, as only rank matters."""
     if step.state == FREE or step.object is None:
         return []
     index, name, grasp = step.index, step.object, str(step.move)
@@ -183,11 +171,8 @@ def _equation(unknowns: Mapping[Unknown, int], measured: Source) -> Equation:
 
 
 def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> dict[Unknown, Row[Source]]:
-    """Unknowns that the equations determine, each as a combination of sources.
-
-    An unknown is in the row space on its own exactly if its pivot row contains no other. `known` unknowns are
-    given.
-    """
+    """Unknowns that the equations determine, each as a combination of sources. An unknown is in the row space
+    on its own exactly if its pivot row contains no other. `known` unknowns are given."""
 
     def unknown(row: Equation) -> list[Unknown]:
         return [key for key in row if not isinstance(key, Source)]
@@ -204,16 +189,12 @@ def determined(equations: Iterable[Equation], known: Iterable[Unknown] = ()) -> 
 
 @dataclass(frozen=True)
 class Evidence:
-    """One way to learn a property: the signals of the subtasks required together.
-
-    `bound`: only a lower bound (a friction coefficient without slip). `given`: properties, determined
-    elsewhere, that are required. `condition`: what the recording must show in addition, if anything.
-    """
+    """One way to learn a property: the signals of the subtasks required together."""
 
     sources: tuple[Source, ...]
-    bound: bool = False
-    given: tuple[Unknown, ...] = ()
-    condition: str | None = None
+    bound: bool = False  # only a lower bound, as of friction without slip
+    given: tuple[Unknown, ...] = ()  # properties, determined elsewhere, that are required
+    condition: str | None = None  # what the recording must show in addition
 
     @property
     def subtasks(self) -> tuple[int, ...]:
@@ -234,15 +215,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Property:
-    """A property of an object: every way to learn it, or the reason why there is none.
-
-    Each of `evidence` suffices by itself, the strongest first. `name` is weight, width, height, friction (of
-    the fingers on the object) or friction_on_SUPPORT.
-    """
+    """A property of an object: every way to learn it, or the reason why there is none."""
 
     object: str
-    name: str
-    evidence: tuple[Evidence, ...]
+    name: str  # weight, width, height, friction (of the fingers on it) or friction_on_SUPPORT
+    evidence: tuple[Evidence, ...]  # each suffices by itself, the strongest first
     reason: str | None = None
 
     @property
@@ -283,11 +260,8 @@ class Decomposition(Tabled):
         return sorted(pairs, key=lambda pair: [pair[0].name == name for name in order], reverse=True)
 
     def in_paper(self, index: int, entry: Property) -> bool:
-        """Whether the paper's Table 1 would list the property for this subtask.
-
-        It reads weight and width only while an object is held above the ground, and mentions friction with a
-        support only in sliding contact (its Sections 2.1 and 3.2).
-        """
+        """Whether the paper's Table 1 would list the property for this subtask: weight and width only while
+        held above the ground, friction with a support only in sliding contact (Sections 2.1 and 3.2)."""
         state = self.subtasks[index].state
         if entry.name in (WEIGHT, WIDTH):
             return state == ABOVE_GROUND
@@ -341,13 +315,9 @@ class Decomposition(Tabled):
         document: dict[str, Any] = {
             "subtasks": [
                 {
-                    "index": subtask.index,
-                    "subtask": subtask.name,
-                    "object": subtask.object,
-                    "state": subtask.state,
-                    "move": None if subtask.move is None else subtask.move + 1,
-                    "support": subtask.support,
-                    "constraints": subtask.constraints,
+                    "index": subtask.index, "subtask": subtask.name, "object": subtask.object,
+                    "state": subtask.state, "move": None if subtask.move is None else subtask.move + 1,
+                    "support": subtask.support, "constraints": subtask.constraints,
                     "properties": [
                         {"property": f"{entry.object}.{entry.name}",
                          "signals": evidence.signals(subtask.index),
@@ -359,14 +329,12 @@ class Decomposition(Tabled):
                 }
                 for subtask in self.subtasks
             ],
-            "minimal": [subtask.index for subtask in self.minimal()],
-            "equation": self.equation(),
+            "minimal": [subtask.index for subtask in self.minimal()], "equation": self.equation(),
             "properties": {
                 name: {key: entry.to_json() for key, entry in entries.items()}
                 for name, entries in self.properties.items()
             },
-            "reasons": self.reasons,
-            "notes": self.notes,
+            "reasons": self.reasons, "notes": self.notes,
         }  # fmt: skip
         if isinstance(self.task, BlockTask):
             rises = height_equations(self.task)
@@ -401,17 +369,8 @@ VARYING_LOAD = "the vertical force must vary while the object slides"
 
 
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
-    """For each performed move, the rise of its object's bottom as a sum of object heights.
-
-    The paper's height of the block beneath (its Table 3) is the case of a single coefficient.
-
-    Args:
-        task: of blocks.
-
-    Returns:
-        (0-based index of the move, {object: coefficient}) per move: bottom height at place less that
-        at pickup. The rise of a slide is {}.
-    """
+    """For each performed move its 0-based index and the rise of its object's bottom, as a sum {object:
+    coefficient} of object heights; {} for a slide. The paper's Table 3 has one coefficient."""
     held, equations = [step for step in subtasks(task) if step.state != FREE], []
     for move, (start, end) in enumerate(zip(held[::3], held[2::3], strict=True)):
         rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}
@@ -476,11 +435,9 @@ def _learn_within(alike: list[list[Subtask]], learned: dict[Unknown, list[Eviden
 
 
 def _learn_friction(step: Subtask, learned: dict[Unknown, list[Evidence]]) -> None:
-    """Friction at the contacts of one subtask, determined where the contact forces are known.
-
-    A fingertip's forces are measured; a support's follow from the balance once the weight is given. Slip
-    determines the coefficient, sticking bounds it from below.
-    """
+    """Friction at the contacts of one subtask, determined where the contact forces are known. A fingertip's
+    forces are measured; a support's follow from the balance once the weight is given. Slip determines the
+    coefficient, sticking bounds it from below."""
     forces, name = (Source(step.index, X_FORCES), Source(step.index, Y_FORCES)), str(step.object)
     learned.setdefault((FRICTION, name), []).append(Evidence(forces, bound=True))
     if step.support is None:

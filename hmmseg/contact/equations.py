@@ -22,8 +22,6 @@ inertia of a carried block alone is written again, where it is compiled: in `sim
 functions accept NumPy and JAX arrays of any broadcastable shapes, in SI units, and raise nothing.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

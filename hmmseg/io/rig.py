@@ -5,20 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from hmmseg.errors import nearest
-from hmmseg.io.schema import (
-    LARGEST,
-    Deviation,
-    Finite,
-    FinitePositive,
-    Name,
-    Positive,
-    StrictTable,
-    read_toml,
-    validated,
-)
+from hmmseg.io.schema import LARGEST, Deviation, Finite, FinitePositive, Name, Positive, StrictTable
 from hmmseg.io.units import Columns
 
 Link = Annotated[FinitePositive, Field(le=10)]  # limit: m; longer ones are in mm or cm
@@ -42,65 +32,41 @@ def _several(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
 
-def _counted(names: tuple[str, ...], counts: tuple[int, ...], expected: str) -> tuple[str, ...]:
-    """Names of columns, of which there must be as many as one of `counts`; ValueError otherwise."""
-    if len(names) not in counts:
-        raise ValueError(f"has {len(names)} columns; expected {expected}")
-    return names
+ByAxis = Annotated[dict[Axis, Name], BeforeValidator(_by_axis)]
+Place = tuple[Finite, Finite, Finite]
 
 
 class Gripper(StrictTable):
-    """A parallel gripper: columns of the tool's pose, opening and wrench, and the tool on the sensor.
+    """A parallel gripper: columns of the tool's pose, opening and wrench, and the tool on the sensor."""
 
-    Attributes:
-        position: columns of the tool's position [m] by axis of the world; an absent axis does not move.
-        quaternion: columns x, y, z, w of the tool's orientation.
-        rotation_vector: columns of axis times angle [rad] instead. Without either the tool does not turn, and
-            its axes are the world's.
-        up: axis of the world against gravity.
-        opening: column of the distance between the pads [m], or one per finger to be summed.
-        wrench: columns fx, fy, fz [N] and optionally tx, ty, tz [N m].
-        frame: the axes of the wrench, those of the `sensor`, the `tool` or the `world`.
-        sensor_axes: axes of the tool along which the sensor's x, y, z point; by default found from free
-            motion.
-        reaction: whether the wrench is exerted by the environment on the tool; by default found as well.
-        closing: axis of the tool along which the pads close.
-        tool_mass: [kg]; by default found from free motion, as an offset of the sensor always is.
-        centre_of_mass: [m] in the tool's axes, from the sensor; may be stated, but forces do not depend on
-            it.
-        fingertip: midpoint of the pads [m] in the tool's axes, from the tool's position.
-        grip_force: force of each pad, a column or a number [N].
-        motor_current: column [A], which with `force_per_ampere` [N/A] gives the grip force.
-    """
-
-    position: Annotated[dict[Axis, Name], BeforeValidator(_by_axis)] = Field(
-        default={"x": "x", "y": "y", "z": "z"}
-    )
-    quaternion: tuple[Name, Name, Name, Name] | None = None
-    rotation_vector: tuple[Name, Name, Name] | None = None
-    up: Direction = "z"
-    opening: Annotated[tuple[Name, ...], BeforeValidator(_several)] = ("opening",)
-    wrench: tuple[Name, ...] = ("fx", "fy", "fz")
-    frame: Literal["sensor", "tool", "world"] = "sensor"
+    position: ByAxis = Field(default={"x": "x", "y": "y", "z": "z"})  # [m]; an absent axis does not move
+    # Without an orientation the tool does not turn, and its axes are the world's.
+    quaternion: tuple[Name, Name, Name, Name] | None = None  # x, y, z, w
+    rotation_vector: tuple[Name, Name, Name] | None = None  # axis times angle [rad] instead
+    up: Direction = "z"  # axis of the world against gravity
+    opening: Annotated[tuple[Name, ...], BeforeValidator(_several)] = ("opening",)  # [m], or of each finger
+    wrench: tuple[Name, ...] = ("fx", "fy", "fz")  # [N], and optionally tx, ty, tz [N m]
+    frame: Literal["sensor", "tool", "world"] = "sensor"  # whose axes the wrench has
+    # Axes of the tool along which the sensor's x, y, z point; by default found from free motion.
     sensor_axes: tuple[Direction, Direction, Direction] | None = None
-    reaction: bool | None = None
-    closing: Axis = "y"
-    tool_mass: FinitePositive | None = None
-    centre_of_mass: tuple[Finite, Finite, Finite] | None = None
-    fingertip: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    grip_force: Name | FinitePositive | None = None
-    motor_current: Name | None = None
+    reaction: bool | None = None  # whether the environment exerts the wrench on the tool; found by default
+    closing: Axis = "y"  # axis of the tool along which the pads close
+    tool_mass: FinitePositive | None = None  # [kg]; found from free motion by default, as any offset is
+    centre_of_mass: Place | None = None  # [m] from the sensor; forces do not need it
+    fingertip: Place = (0.0, 0.0, 0.0)  # [m] middle of the pads, in the tool's axes
+    grip_force: Name | FinitePositive | None = None  # [N] of each pad: a column or a number
+    motor_current: Name | None = None  # [A], which times `force_per_ampere` [N/A] is the grip force
     force_per_ampere: FinitePositive | None = None
 
-    @field_validator("wrench")
+    @field_validator("wrench", "opening")
     @classmethod
-    def _whole(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        return _counted(names, (3, 6), "3 forces, or 3 forces and 3 torques")
-
-    @field_validator("opening")
-    @classmethod
-    def _of_fingers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        return _counted(names, (1, 2), "one, or one for each finger")
+    def _counted(cls, names: tuple[str, ...], of: ValidationInfo) -> tuple[str, ...]:
+        counts, expected = (1, 2), "one, or one for each finger"
+        if of.field_name == "wrench":
+            counts, expected = (3, 6), "3 forces, or 3 forces and 3 torques"
+        if len(names) not in counts:
+            raise ValueError(f"has {len(names)} columns; expected {expected}")
+        return names
 
     @field_validator("sensor_axes")
     @classmethod
@@ -145,10 +111,7 @@ def direction(axis: str) -> Any:
 
 
 class Finger(StrictTable):
-    """One planar two-link finger with absolute link angles (parallelogram linkage).
-
-    tip = base + L1 (cos q1, sin q1) + L2 (cos q2, sin q2), all in m.
-    """
+    """One planar two-link finger with absolute link angles: tip = base + sum of L (cos q, sin q), in m."""
 
     base: tuple[Finite, Finite]
     links: tuple[Link, Link]
@@ -162,16 +125,12 @@ class Fingertip(StrictTable):
 
 
 class Noise(StrictTable):
-    """Noise standard deviations of one sample; None is learned from the recording.
+    """Noise standard deviations of one sample; None is learned from the recording."""
 
-    `angle` [rad] and `velocity` [rad/s] of a jointed hand, `position` [m] and `velocity` [m/s] of a Cartesian
-    one, and `force` [N] of both.
-    """
-
-    angle: FinitePositive | None = None
-    position: FinitePositive | None = None
-    velocity: FinitePositive | None = None
-    force: FinitePositive | None = None
+    angle: FinitePositive | None = None  # [rad] of a jointed hand
+    position: FinitePositive | None = None  # [m] of a Cartesian one
+    velocity: FinitePositive | None = None  # [rad/s] or [m/s]
+    force: FinitePositive | None = None  # [N]
 
 
 def _per_entry(names: tuple[str, ...]) -> BeforeValidator:
@@ -197,19 +156,15 @@ def _per_entry(names: tuple[str, ...]) -> BeforeValidator:
 FORCE_CHANNELS = ("fx1", "fy1", "fx2", "fy2")
 JOINTS = ("q11", "q12", "q21", "q22")
 _Four = tuple[Deviation, Deviation, Deviation, Deviation]
+_Forces = Annotated[_Four, _per_entry(FORCE_CHANNELS)]
 
 
 class Systematic(StrictTable):
-    """Standard deviations of errors common to all trials; 0 where absent. One number stands for all entries.
+    """Standard deviations of errors common to all trials, relative if no unit is said; one number for all."""
 
-    `force_bias` [N] and `force_gain` (relative) per finger and axis (fx1, fy1, fx2, fy2), `joint_offset`
-    [rad] per joint (q11, q12, q21, q22), `link_length` per link (finger 1's two, then finger 2's) and
-    `pad_stiffness` per finger, both relative.
-    """
-
-    force_bias: Annotated[_Four, _per_entry(FORCE_CHANNELS)] = (0.0, 0.0, 0.0, 0.0)
-    force_gain: Annotated[_Four, _per_entry(FORCE_CHANNELS)] = (0.0, 0.0, 0.0, 0.0)
-    joint_offset: Annotated[_Four, _per_entry(JOINTS)] = (0.0, 0.0, 0.0, 0.0)
+    force_bias: _Forces = (0.0, 0.0, 0.0, 0.0)  # [N]
+    force_gain: _Forces = (0.0, 0.0, 0.0, 0.0)
+    joint_offset: Annotated[_Four, _per_entry(JOINTS)] = (0.0, 0.0, 0.0, 0.0)  # [rad]
     link_length: Annotated[_Four, _per_entry(("11", "12", "21", "22"))] = (0.0, 0.0, 0.0, 0.0)
     pad_stiffness: Annotated[tuple[Deviation, Deviation], _per_entry(("1", "2"))] = (0.0, 0.0)
 
@@ -283,9 +238,9 @@ class Rig(StrictTable):
 
 def parse_rig(table: dict[str, Any], where: str = "rig") -> Rig:
     """Rig from the table of a `rig.toml`; InputError names the key at fault."""
-    return validated(Rig, table, where)
+    return Rig.validated(table, where)
 
 
 def read_rig(path: str | Path) -> Rig:
     """Rig from a `rig.toml` file; InputError for anything at fault."""
-    return parse_rig(read_toml(path), str(path))
+    return Rig.from_toml(path)

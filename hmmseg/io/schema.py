@@ -1,13 +1,11 @@
 """Strict TOML and JSON tables: reading, and validation that reports a fault in one line."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib
 import typing
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -37,27 +35,29 @@ class StrictTable(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
+    @classmethod
+    def validated(cls, table: dict[str, Any], where: str) -> Self:
+        """The table as this model; InputError names the key at fault and the nearest known one."""
+        try:
+            return cls.model_validate(table)
+        except ValidationError as error:
+            first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = _known_keys(cls, first["loc"])
+            raise InputError(f"{where}: key {key}", "unknown key", nearest(str(first["loc"][-1]), known))
+        if first["type"] == "missing":
+            raise InputError(f"{where}: key {key}", "missing", "a value")
+        problem = first["msg"].removeprefix("Value error, ")
+        if first["type"] != "value_error":
+            found = repr(first.get("input"))
+            problem += f" (found {found if len(found) < 100 else found[:100] + '...'})"
+        raise InputError(f"{where}: key {key}" if key else where, problem)
 
-Model = TypeVar("Model", bound=StrictTable)
-
-
-def validated(model: type[Model], table: dict[str, Any], where: str) -> Model:
-    """The table as this model; InputError names the key at fault and the nearest known one."""
-    try:
-        return model.model_validate(table)
-    except ValidationError as error:
-        first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        known = _known_keys(model, first["loc"])
-        raise InputError(f"{where}: key {key}", "unknown key", nearest(str(first["loc"][-1]), known))
-    if first["type"] == "missing":
-        raise InputError(f"{where}: key {key}", "missing", "a value")
-    problem = first["msg"].removeprefix("Value error, ")
-    if first["type"] != "value_error":
-        found = repr(first.get("input"))
-        problem += f" (found {found if len(found) < 100 else found[:100] + '...'})"
-    raise InputError(f"{where}: key {key}" if key else where, problem)
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """The same from a TOML file; InputError as well if it cannot be read."""
+        return cls.validated(read_toml(path), str(path))
 
 
 def _known_keys(model: type[BaseModel], location: tuple[Any, ...]) -> list[str]:

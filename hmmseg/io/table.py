@@ -1,7 +1,5 @@
 """Tables as files and data frames hold them, and numeric columns from them, before anything is mapped."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -20,32 +18,18 @@ MAX_COLUMNS = 20_000  # limit: no robot records so many; the arrays of each take
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one file or frame under their own names.
+    """Columns of one file or frame under their own names."""
 
-    Attributes:
-        file: name for messages.
-        names: all columns of the file.
-        columns: those that were read. Their lengths may differ, as a demonstration has more states than
-            actions.
-        rows: (num_rows,) numbers of the rows, as an editor counts them; as many as most columns have.
-        units: those stated by the file itself.
-        origin: where t = 0 lies in ns since 1970 (logs).
-        interpolated: by column, samples between two messages.
-        messages: whether it is a log of messages.
-        rates: [Hz] of the messages.
-        notes: what was left out of the file.
-    """
-
-    file: str
-    names: tuple[str, ...]
-    columns: dict[str, np.ndarray]
-    rows: np.ndarray
-    units: dict[str, str] = field(default_factory=dict)
-    origin: int | None = None
-    interpolated: dict[str, np.ndarray] = field(default_factory=dict)
-    messages: bool = False
-    rates: dict[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    file: str  # name for messages
+    names: tuple[str, ...]  # all columns of the file
+    columns: dict[str, np.ndarray]  # those read, of lengths that may differ: more states than actions, say
+    rows: np.ndarray  # (num_rows,) numbers as an editor counts them; as many as most columns have
+    units: dict[str, str] = field(default_factory=dict)  # as stated by the file itself
+    origin: int | None = None  # where t = 0 lies in ns since 1970 (logs)
+    interpolated: dict[str, np.ndarray] = field(default_factory=dict)  # samples between two messages
+    messages: bool = False  # whether it is a log of messages
+    rates: dict[str, float] = field(default_factory=dict)  # [Hz] of the messages
+    notes: tuple[str, ...] = ()  # what was left out of the file
 
 
 def make_table(
@@ -102,8 +86,7 @@ def flat(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def numbers(table: Table, name: str) -> np.ndarray:
-    """A column as float64 (num_rows,), NaN where its cell is empty; InputError for a row that is no
-    number."""
+    """A column as float64 (num_rows,), NaN where its cell is empty; InputError for what is no number."""
     column = table.columns[name]
     where = f"{table.file}: column {name}"
     if column.dtype.kind in "fiu":
@@ -139,10 +122,7 @@ def holds_text(values: np.ndarray) -> bool:
 
 
 def times(table: Table, name: str) -> tuple[np.ndarray, int | None]:
-    """A column of times (num_rows,) [s], and where its zero lies in ns since 1970 if it holds dates.
-
-    ISO 8601 stamps and dates become s since the first; numbers stay as they are.
-    """
+    """A column of times (num_rows,) [s], of dates since the first, and the first in ns since 1970."""
     column = table.columns[name]
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.float64) * 1e-9, None

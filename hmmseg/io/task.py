@@ -53,14 +53,11 @@ class Task:
 
 @dataclass(frozen=True)
 class BlockTask(Task):
-    """Blocks, what each stands on at the start, and the moves in order.
-
-    `repeat`: how many times the list of moves is performed; "unknown": as often as the recording shows.
-    """
+    """Blocks, what each stands on at the start, and the moves in order."""
 
     initial: dict[str, str]
     moves: tuple[Move, ...]
-    repeat: int | Literal["unknown"] = 1
+    repeat: int | Literal["unknown"] = 1  # "unknown": as often as the recording shows
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -75,14 +72,11 @@ class BlockTask(Task):
 
 @dataclass(frozen=True)
 class SequenceTask(Task):
-    """A plain ordered task: named states over arbitrary channels, without block physics.
-
-    `channels` None means every column but `t`; states in `optional` may be skipped.
-    """
+    """A plain ordered task: named states over arbitrary channels, without block physics."""
 
     sequence: tuple[str, ...]
-    channels: tuple[str, ...] | None = None
-    optional: tuple[str, ...] = ()
+    channels: tuple[str, ...] | None = None  # None: every column but `t`
+    optional: tuple[str, ...] = ()  # states that may be skipped
 
 
 AnyTask = BlockTask | SequenceTask
@@ -212,11 +206,7 @@ def _parse_move(number: int, entry: Any, where: str) -> Move:
 
 
 def _check_moves(task: BlockTask, where: str) -> None:
-    """Simulate the moves; InputError with the number of the first impossible one.
-
-    An unknown number of rounds is simulated until an arrangement of the objects recurs: nothing new can
-    happen from there on.
-    """
+    """Simulate the moves until an arrangement recurs; InputError with the number of an impossible one."""
     support, seen = dict(task.initial), [dict(task.initial)]
     for round_ in range(1, (MAX_REPEAT if task.repeat == "unknown" else task.repeat) + 1):
         for number, move in enumerate(task.moves, 1):

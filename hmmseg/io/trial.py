@@ -120,10 +120,7 @@ class Trial(Tabled):
 
 
 def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bool = True) -> Trial:
-    """Trial from a table, before any checks of the hand; InputError for invalid columns.
-
-    `whole`: whether it is a whole recording, all of whose channels must have some values.
-    """
+    """Trial from a table, before checks of the hand; InputError for bad columns, empty ones if `whole`."""
     names, optional = channels_of(rig, task)
     columns: Mapping[str, Column] = {} if rig is None else (rig.topics if table.messages else rig.columns)
     for name, values in table.columns.items():

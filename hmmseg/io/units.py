@@ -13,8 +13,6 @@ ours = sign * theirs in SI + offset, the offset in SI. A channel that is not map
 name.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Signals, or any channels, stacked over time, with the subtasks of a segmentation behind them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,8 +19,7 @@ LABEL_SLANT = 40  # look: degrees
 def stacked_panels(
     figure: Figure, t: np.ndarray, panels: Mapping[str, np.ndarray], segmentation: Segmentation
 ) -> list[Axes]:
-    """Draw signals (num_timesteps,) by label at times t [s] in stacked panels, with the subtasks behind
-    them."""
+    """Draw signals (num_timesteps,) by label at times t [s] in stacked panels, over the subtasks."""
     axes = list(np.atleast_1d(figure.subplots(len(panels), 1, sharex=True)))
     for ax, (label, values) in zip(axes, panels.items(), strict=True):
         # Single samples between missing ones would be invisible in a line.
@@ -37,10 +34,8 @@ def stacked_panels(
     axes[-1].set_xlabel("Time [s]")
     axes[-1].set_xlim(t[0], t[-1])
     name_spans(axes[0], segmentation)
-    if segmentation.failed is not None:
-        figure.suptitle(
-            f"does not fit its task at {segmentation.failed.label}", fontsize=8, fontweight="bold"
-        )
+    if (failed := segmentation.failed) is not None:
+        figure.suptitle(f"does not fit its task at {failed.label}", fontsize=8, fontweight="bold")
     colours = state_colours([span.state for span in segmentation.spans])
     handles = [Patch(color=colour, alpha=0.32, lw=0, label=state) for state, colour in colours.items()]
     handles.append(Patch(facecolor=INK, alpha=0.28, lw=0, label="boundary, 90 % interval"))
@@ -70,10 +65,7 @@ def name_spans(ax: Axes, segmentation: Segmentation) -> None:
 
 
 def draw_signals(signals: Signals, segmentation: Segmentation, path: Path | None = None) -> list[Axes]:
-    """Plot mean position, finger distance, grip, net and shear forces over coloured subtasks.
-
-    After the paper's Figures 5 to 7.
-    """
+    """Plot position, distance, grip, net and shear forces over subtasks, after the paper's Figures 5 to 7."""
     panels = {
         "Mean $x$\n[cm]": 100 * signals.x,
         "Mean $y$\n[cm]": 100 * signals.y,

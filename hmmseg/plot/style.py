@@ -1,7 +1,5 @@
 """Style that all figures share: colour-blind safe colours, fonts, sizes, saving."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,16 +32,12 @@ STYLE: dict[Any, Any] = {
 
 @contextmanager
 def canvas(
-    path: Path | None,
-    width: float = WIDTH,
-    height: float = 3.0,
+    path: Path | None, width: float = WIDTH, height: float = 3.0,
     layout: Literal["constrained"] | None = "constrained",
-) -> Iterator[Figure]:
-    """An empty figure of this size [in], saved to `path` (kind by its suffix) when the block ends.
-
-    Without pyplot: nothing stays open and no display is needed. Without a path the caller shows the figure;
-    in a notebook, or if a script has loaded pyplot, it is one of pyplot's.
-    """
+) -> Iterator[Figure]:  # fmt: skip
+    """An empty figure of this size [in], saved to `path` (kind by its suffix) when the block ends. Without
+    pyplot: nothing stays open and no display is needed. Without a path the caller shows the figure; in a
+    notebook, or if a script has loaded pyplot, it is one of pyplot's."""
     with matplotlib.rc_context(STYLE):
         if path is None and not sys.modules.keys().isdisjoint(("matplotlib.pyplot", "ipykernel")):
             from matplotlib import pyplot

@@ -14,8 +14,6 @@ coarsened posterior (Miller and Dunson, J. Am. Stat. Assoc. 114, 2019) counts al
 `independent` observations.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,11 +30,9 @@ MAX_BLOCKS = 250  # numerics: the cost table is quadratic in this
 def partition(
     values: np.ndarray, num_stretches: int, floor: float, cuts: Sequence[int] | np.ndarray = ()
 ) -> np.ndarray:
-    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 with the least total cost.
-
-    A stretch of n blocks costs n/2 log(variance + floor^2) per column of `values` (num_cells, num_features),
-    which must be finite; no stretch crosses the cells `cuts`. ValueError for fewer cells than stretches.
-    """
+    """Path (num_cells,) of stretch numbers 0 .. num_stretches - 1 with the least total cost, n/2 log(variance
+    + floor^2) of a stretch of n blocks per column of the finite `values` (num_cells, num_features); none
+    crosses the cells `cuts`. ValueError for fewer cells than stretches."""
     num_cells = len(values)
     if num_cells < num_stretches:
         raise ValueError(f"{num_cells} cells, expected at least {num_stretches}")
@@ -61,9 +57,7 @@ def partition(
 
 def pooled_costs(count: np.ndarray, first: np.ndarray, second: np.ndarray, floor: float) -> np.ndarray:
     """Cost [a, b] (N + 1, N + 1) of merging the parts a <= k < b into one stretch, inf for an empty one.
-
-    `count` (N,): cells in each part; `first`, `second` (N, num_features): sums of values and of squares.
-    """
+    `count` (N,): cells in each part; `first`, `second` (N, num_features): sums of values and of squares."""
     n, x, x2 = (np.concatenate([np.zeros((1, *v.shape[1:])), np.cumsum(v, axis=0)])
                 for v in (count.astype(float), first, second))  # fmt: skip
     number = n[None] - n[:, None]
@@ -85,22 +79,13 @@ MERGE_FLOOR = 0.4  # chosen: least scale of a merged stretch, so that quiet chan
 
 @dataclass(frozen=True)
 class Course:
-    """One alignment of all trials.
+    """One alignment of all trials."""
 
-    Attributes:
-        probability: [(num_cells, num_stretches), ...] of each stretch, on the coarse grid.
-        ends: (num_trials, num_stretches - 1), ends of stretches as shares of the trial.
-        cost: [a, b] (num_stretches + 1, ...) of stretches a <= k < b as one state, in nats with every cell
-            counted as one independent observation.
-        share: independent observations per cell, from the residuals.
-        seen: (num_stretches - 1,) log probability that a change is real, not one level cut in two.
-    """
-
-    probability: list[np.ndarray]
-    ends: np.ndarray
-    cost: np.ndarray
-    share: float
-    seen: np.ndarray
+    probability: list[np.ndarray]  # [(num_cells, num_stretches), ...] of each stretch, on the coarse grid
+    ends: np.ndarray  # (num_trials, num_stretches - 1) of stretches as shares of the trial
+    cost: np.ndarray  # [a, b] (num_stretches + 1, ...) [nats] of a <= k < b as one state, all cells counted
+    share: float  # independent observations per cell, from the residuals
+    seen: np.ndarray  # (num_stretches - 1,) log probability that a change is real, not one level cut in two
 
     @property
     def observations(self) -> float:
@@ -109,11 +94,8 @@ class Course:
 
 
 def find_courses(values: Sequence[np.ndarray], num_states: int, labels: Sequence[np.ndarray]) -> list[Course]:
-    """Distinct courses of trials `values` [(num_cells, num_features), ...] on a coarse grid.
-
-    `labels` [(num_states - 1,), ...]: known boundaries as shares of each trial, NaN where unknown. Labelled
-    trials are tried first as starts, with stretches that end at the labels.
-    """
+    """Distinct courses of trials `values` [(num_cells, num_features), ...] on a coarse grid. `labels` as in
+    `naming`; labelled trials are tried first as starts, with stretches that end at the labels."""
     most = max(num_states, min(map(len, values)) // 2)
     numbers = dict.fromkeys(min(m * num_states + 1, most) for m in MULTIPLES)
     labelled = [i for i, known in enumerate(labels) if np.isfinite(known).any()]
@@ -153,11 +135,8 @@ def _learn_course(
 
 
 def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, share: float) -> np.ndarray:
-    """Log probability (number - 1,) that each change is real, against one state on both sides of it.
-
-    By `share` independent observations per cell: each side has its own mean and variance per channel (Schwarz
-    criterion), and the change is equally likely between any two cells of a trial.
-    """
+    """Log probability (number - 1,) that each change is real, against one state on both sides, by `share`
+    independent observations per cell and the Schwarz criterion."""
     bridged = [np.arcsinh(fill_gaps(v)) for v in values]
     stacked, path = np.vstack(bridged), np.concatenate(paths)
     features = stacked.shape[1]
@@ -195,25 +174,15 @@ NEAR = 0.02  # chosen: share of a trial within which two boundaries are the same
 
 @dataclass(frozen=True)
 class Weighing:
-    """Prior weights of choices, learned on sequences of many kinds (`experiments.sequences learn`).
+    """Prior weights of choices, learned on sequences of many kinds (`experiments.sequences learn`)."""
 
-    Attributes:
-        independent: number of observations to which evidence is coarsened.
-        settled: log odds of an unnamed state after the last event.
-        shares: exponent of the share of the trial that each state but the last takes.
-        lag: scale of the Laplace law of boundaries about their change, as a share of the trial.
-        labelled: the same where labels tell the mean lag.
-        elsewhere: probability that a boundary is at no change at all.
-        unseen: prior weight of a change that the channels do not show, relative to one that they do.
-    """
-
-    independent: float
-    settled: float
-    shares: float
-    lag: float
-    labelled: float
-    elsewhere: float
-    unseen: float
+    independent: float  # number of observations to which evidence is coarsened
+    settled: float  # log odds of an unnamed state after the last event
+    shares: float  # exponent of the share of the trial that each state but the last takes
+    lag: float  # scale of the Laplace law of boundaries about their change, as a share of the trial
+    labelled: float  # the same where labels tell the mean lag
+    elsewhere: float  # probability that a boundary is at no change at all
+    unseen: float  # prior weight of a change that the channels do not show, relative to one that they do
 
 
 WEIGHING = Weighing(
@@ -229,43 +198,28 @@ WEIGHING = Weighing(
 
 @dataclass(frozen=True)
 class Naming:
-    """Which changes of one course are the named boundaries.
+    """Which changes of one course are the named boundaries."""
 
-    Attributes:
-        log_evidence: of the course [nats], averaged over all choices.
-        probability: (num_boundaries, num_changes) that boundary b is change j.
-        settled: (num_changes,) that a settled state begins at change j.
-    """
-
-    log_evidence: float
-    probability: np.ndarray
-    settled: np.ndarray
+    log_evidence: float  # [nats] averaged over all choices
+    probability: np.ndarray  # (num_boundaries, num_changes) that boundary b is change j
+    settled: np.ndarray  # (num_changes,) that a settled state begins at change j
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Changes of one course chosen as the boundaries of its task.
+    """Changes of one course chosen as its task's boundaries."""
 
-    Attributes:
-        course: its index.
-        ends: changes, numbered from 1, that end the named states, the last one only if `settled`.
-        settled: whether a settled state follows the last named one.
-        right: (num_boundaries,) probability that each boundary is within NEAR of the chosen change.
-    """
-
-    course: int
-    ends: tuple[int, ...]
-    settled: bool
-    right: np.ndarray
+    course: int  # its index
+    ends: tuple[int, ...]  # changes, from 1, that end the named states, the last one only if settled
+    settled: bool  # whether a settled state follows the last named one
+    right: np.ndarray  # (num_boundaries,) probability that each is within NEAR of the chosen change
 
 
 def naming(
     course: Course, num_states: int, labels: Sequence[np.ndarray], weighing: Weighing = WEIGHING
 ) -> Naming:
-    """Sum over all choices of `num_states` - 1 >= 1 boundaries among the changes of a course.
-
-    `labels` [(num_states - 1,), ...]: known boundaries of each trial as shares of it, NaN where unknown.
-    """
+    """Sum over all choices of `num_states` - 1 >= 1 boundaries among the changes of a course. `labels`
+    [(num_states - 1,), ...]: known boundaries of each trial as shares of it, NaN where unknown."""
     # Log weights: groups [a, b] of stretches a <= k < b as one named state; tail [a] of those from a on as
     # the last one, and end [a, e] with a settled state from e on; change of a change that ends a state.
     temper = weighing.independent * course.share / (weighing.independent + course.observations)

@@ -13,8 +13,6 @@ Durations are geometric with a learned mean: memoryless, so that cropping the st
 so that time alone decides little. Optional states may be skipped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -47,11 +45,9 @@ class StudentEmissions:
 
 def update(emissions: StudentEmissions, values: np.ndarray, weights: np.ndarray,
            floor: float) -> StudentEmissions:  # fmt: skip
-    """One EM step for location and scale (Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 1989).
-
-    `values` (num_cells, num_features) of all trials; `weights` (num_cells, num_states): posterior state
-    probabilities; scales are at least `floor`.
-    """
+    """One EM step for location and scale (Lange, Little and Taylor, J. Am. Stat. Assoc. 84, 1989). `values`
+    (num_cells, num_features) of all trials; `weights` (num_cells, num_states): posterior state probabilities;
+    scales are at least `floor`."""
     loc, scale = emissions.loc.copy(), emissions.scale.copy()
     known = np.isfinite(values)
     x = np.where(known, values, 0.0)
@@ -111,23 +107,15 @@ LEAST_SPREAD = 0.05  # chosen: share of a window's usual spread; labels align no
 
 @dataclass(frozen=True)
 class Detectors:
-    """Templates of all boundaries; windows have `2 * half` cells.
-
-    Attributes:
-        mean, spread: (num_boundaries, 2 * half, num_channels) of the template.
-        usual: (num_channels,) spread of windows anywhere.
-        jitter: (num_boundaries,) [cells] scatter of held-out labels in excess of their posterior.
-        weight: factor of the log-likelihood ratio, as neighbouring cells and channels are dependent.
-        state_weight: factor of the emissions' log-likelihoods next to it.
-    """
+    """Templates of all boundaries; windows have `2 * half` cells."""
 
     half: int
-    mean: np.ndarray
-    spread: np.ndarray
-    usual: np.ndarray
-    jitter: np.ndarray
-    weight: float = 0.0
-    state_weight: float = 1.0
+    mean: np.ndarray  # (num_boundaries, 2 * half, num_channels) of the template
+    spread: np.ndarray  # the same
+    usual: np.ndarray  # (num_channels,) spread of windows anywhere
+    jitter: np.ndarray  # (num_boundaries,) [cells] scatter of held-out labels in excess of their posterior
+    weight: float = 0.0  # of the log-likelihood ratio, as neighbouring cells and channels are dependent
+    state_weight: float = 1.0  # of the emissions' log-likelihoods next to it
 
     def crossing(self, values: np.ndarray) -> np.ndarray:
         """Log weights (num_cells - 1, num_boundaries) of crossing, from the features of a trial."""
@@ -154,11 +142,9 @@ def _windows(values: np.ndarray, half: int) -> np.ndarray:
 
 
 def learn(trials: Sequence[np.ndarray], edges: Sequence[np.ndarray], half: int) -> Detectors:
-    """Templates from channels [(num_cells, num_channels), ...] and labelled edges.
-
-    `edges[i][b]`: the cell before boundary b of trial i; -1 where the boundary has no course of its own (a
-    skipped subtask). A boundary that no trial has gets ratio 0 everywhere.
-    """
+    """Templates from channels [(num_cells, num_channels), ...] and labelled edges. `edges[i][b]`: the cell
+    before boundary b of trial i; -1 where the boundary has no course of its own (a skipped subtask). A
+    boundary that no trial has gets ratio 0 everywhere."""
     windows = [_windows(values, half) for values in trials]
     usual = np.sqrt(np.nanmean(np.vstack(windows) ** 2, axis=(0, 1)))
     usual = np.maximum(np.nan_to_num(usual), 1e-6)
@@ -182,35 +168,23 @@ def transitions(mean_cells: np.ndarray, presence: np.ndarray, optional: Sequence
 
 
 def add_detectors(chain: Chain, crossing: np.ndarray) -> Chain:
-    """The chain with log weights (num_cells - 1, num_boundaries) of crossing each boundary added.
-
-    A path that skips a state crosses both its boundaries.
-    """
+    """The chain with log weights (num_cells - 1, num_boundaries) of crossing, both of a skipped state."""
     total = np.pad(np.cumsum(crossing, axis=1), ((0, 0), (1, 0)))
     stay, *jumps = chain.bands
-    advance, *skips = (
-        band + total[:, d:] - total[:, : total.shape[1] - d] for d, band in enumerate(jumps, 1)
-    )
+    advance, *skips = (band + total[:, d:] - total[:, :-d] for d, band in enumerate(jumps, 1))
     ends = {"log_initial": chain.log_initial, "log_final": chain.log_final}
     return Chain(stay, advance, skips or None, **ends)
 
 
 @dataclass
 class Learner:
-    """EM over `values` [(num_cells, num_features), ...] of all trials.
+    """EM over the features of all trials."""
 
-    Args:
-        values: features of each trial, NaN where missing.
-        names: of the task's states; states of one name share emissions.
-        optional: (num_states,) whether a state may be skipped.
-        known: path (num_cells,) of each fully labelled trial, which stays fixed, else None.
-        allowed: (num_cells, num_states), -inf where labels forbid a state and 0 elsewhere; None without any.
-    """
-
-    values: list[np.ndarray]
-    names: Sequence[str]
-    optional: Sequence[bool]
-    known: list[np.ndarray | None] = field(default_factory=list)
+    values: list[np.ndarray]  # [(num_cells, num_features), ...], NaN where missing
+    names: Sequence[str]  # of the task's states; states of one name share emissions
+    optional: Sequence[bool]  # (num_states,) whether a state may be skipped
+    known: list[np.ndarray | None] = field(default_factory=list)  # fixed path of each fully labelled trial
+    # (num_cells, num_states), -inf where labels forbid a state and 0 elsewhere; None without any
     allowed: list[np.ndarray | None] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -232,9 +206,7 @@ class Learner:
     def align(self, emissions: StudentEmissions, law: Chain,
               detectors: Detectors | None = None) -> list[AlignmentPosterior]:  # fmt: skip
         """Posterior alignments of all trials, within what labels allow."""
-        tables, chains = zip(
-            *(weigh(values, emissions, law, detectors) for values in self.values), strict=True
-        )
+        tables, chains = zip(*(weigh(v, emissions, law, detectors) for v in self.values), strict=True)
         tables = [ll if free is None else ll + free for ll, free in zip(tables, self.allowed, strict=True)]
         return align(tables, chains)
 
@@ -273,10 +245,7 @@ def weigh(values: np.ndarray, emissions: StudentEmissions, law: Chain,
 
 
 def durations(probability: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean durations [cells] and presence (num_states,), from posterior state probabilities.
-
-    Presence has a Beta(1, 1) prior.
-    """
+    """Mean durations [cells] and presence (num_states,), with a Beta(1, 1) prior, from posteriors."""
     visited = np.array([p.max(0) for p in probability])
     cells = np.sum([p.sum(0) for p in probability], 0) / np.maximum(visited.sum(0), 0.5)
     return np.maximum(cells, LEAST_CELLS), (visited.sum(0) + 1) / (len(probability) + 2)

@@ -4,8 +4,6 @@ Each channel gives its value and an edge-preserving slope. Samples are averaged 
 trials of a model, so that rate, gaps and uneven sampling do not matter; an empty cell is NaN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,17 +20,13 @@ SMOOTHING = 0.01  # chosen: slope window, as a share of the median trial's durat
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """From channels to features, fixed once for all trials of a model.
-
-    `step` [s]: width of a cell; `window` [cells]: width of slopes; `center`, `scale` (num_features,):
-    standardisation, the values of all channels first, then their slopes.
-    """
+    """From channels to features, fixed once for all trials of a model."""
 
     channels: tuple[str, ...]
-    step: float
-    window: int
-    center: np.ndarray
-    scale: np.ndarray
+    step: float  # [s] width of a cell
+    window: int  # [cells] width of slopes
+    center: np.ndarray  # (num_features,) values of all channels, then their slopes
+    scale: np.ndarray  # (num_features,)
 
 
 @dataclass(frozen=True)
@@ -53,10 +47,7 @@ class SequenceFeatures:
 
 
 def drop_repeats(values: np.ndarray) -> np.ndarray:
-    """A channel (num_timesteps,) without repeated readings (NaN) if it is sampled at a lower rate than rows.
-
-    That is so where no two consecutive samples both change: each repeats the last reading.
-    """
+    """A channel (num_timesteps,) without repeated readings (NaN) if it is sampled more slowly than rows."""
     changes = np.flatnonzero(np.diff(values) != 0) + 1
     if changes.size < FEWEST or (period := int(np.diff(changes).min())) < 2:
         return values
@@ -66,10 +57,7 @@ def drop_repeats(values: np.ndarray) -> np.ndarray:
 
 
 def cell_means(trial: Trial, channels: Sequence[str], step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Edges (num_cells + 1,) and mean of each channel (num_cells, num_channels), NaN in empty cells.
-
-    InputError where the trial lacks a channel.
-    """
+    """Edges (num_cells + 1,), means (num_cells, num_channels), NaN in empty cells; InputError if none."""
     for name in channels:
         if name not in trial.channels:
             raise InputError(trial.file, f"has no channel {name}", f"channels {', '.join(channels)}")
@@ -93,10 +81,8 @@ def fill_gaps(x: np.ndarray) -> np.ndarray:
 
 def edge_preserving_slopes(x: np.ndarray, window: int) -> np.ndarray:
     """Slope (num_cells, num_channels) by least squares over `window` cells before, around or after each cell.
-
     Of the three windows the one with the best linear fit is used (Kuwahara et al., Digital Processing of
-    Biomedical Images, 1976), so that no slope extends across a jump.
-    """
+    Biomedical Images, 1976), so that no slope extends across a jump."""
     num_cells = len(x)
     window = min(window, num_cells)
     if window < 2:

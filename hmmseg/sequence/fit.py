@@ -1,7 +1,5 @@
 """Fit a plain ordered task to trials: EM within the forced order, from labels where there are any."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -53,19 +51,8 @@ ENOUGH = 2  # numerics: fully labelled trials for boundary templates: one is lef
 
 
 def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | None = None) -> SequenceModel:
-    """Learn emissions and durations of a plain ordered task.
-
-    Args:
-        trials: recordings, labelled or not; unlabelled ones contribute too.
-        task: the order of the subtasks.
-        labels: as `read_labels` takes them; None of no trial.
-
-    Returns:
-        The fitted model.
-
-    Raises:
-        InputError: trials too short for the task, missing channels or labels that do not fit.
-    """
+    """Learn emissions and durations of a plain ordered task from trials, labelled (as `read_labels` takes it)
+    or not; InputError for trials too short for it, missing channels or labels that do not fit."""
     if not trials:
         raise InputError("trials", "none given", "at least one trial")
     channels = task.channels or tuple(n for n in trials[0].channels if all(n in t.channels for t in trials))
@@ -84,22 +71,9 @@ def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | N
 
 
 def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:
-    """Known boundaries of each trial.
-
-    Args:
-        trials: recordings of the task.
-        task: the order of the subtasks.
-        labels: one entry for each trial, or entries by the trials' names (with or without suffix), or a
-            folder or table for `label_files`. An entry holds boundaries [s], one fewer than subtasks, None
-            where unknown, or {subtask: its start}; a skipped optional subtask has two equal ones. None: no
-            label.
-
-    Returns:
-        Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown.
-
-    Raises:
-        InputError: labels that are none of these trials', or do not fit the task.
-    """
+    """Known boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown, from an entry for each or by
+    name, or a folder or table for `label_files`. An entry holds boundaries, None where unknown, or {subtask:
+    its start}; a skipped subtask has two equal ones. InputError if they do not fit."""
     if isinstance(labels, str | Path):
         labels = label_files(Path(labels), trials)
     if isinstance(labels, Mapping):
@@ -125,19 +99,9 @@ def _is_named(name: str, trial: Trial) -> bool:
 
 
 def label_files(where: Path, trials: Sequence[Trial]) -> dict[str, Any]:
-    """Labels by trial, from a folder or a table.
-
-    Args:
-        where: a folder with NAME.json for some of the trials, {"boundaries": [times in s, null where
-            unknown]}, or a table (CSV, TSV in any dialect) with the columns trial, subtask and start [s].
-        trials: the trials.
-
-    Returns:
-        Entries for `read_labels` by the trials' names.
-
-    Raises:
-        InputError: there are no labels, they cannot be read, or they are of other trials.
-    """
+    """Entries for `read_labels` by the trials' names, from a folder with NAME.json, {"boundaries": [s or
+    null, ...]}, or a table (CSV, TSV) with columns trial, subtask and start [s]; InputError if there is
+    none."""
     if where.is_dir():
         files = {trial.name: where / f"{trial.stem}.json" for trial in trials}
         out = {name: _boundaries(path) for name, path in files.items() if path.exists()}
@@ -203,9 +167,8 @@ def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
     except (TypeError, ValueError):
         raise InputError(where, f"found {given!r}", "a list of times in s") from None
     if boundaries.shape != (len(names),):
-        raise InputError(
-            where, f"has {boundaries.size} boundaries", f"{len(names)} for {len(names) + 1} subtasks"
-        )
+        expected = f"{len(names)} for {len(names) + 1} subtasks"
+        raise InputError(where, f"has {boundaries.size} boundaries", expected)
     if not np.isfinite(boundaries[~unknown]).all():
         raise InputError(where, "has a boundary that is no number", "times in s")
     at = np.flatnonzero(~unknown)
@@ -223,10 +186,7 @@ def _check_labels(given: Any, trial: Trial, task: SequenceTask) -> np.ndarray:
 
 
 def label_constraints(trial: SequenceFeatures, boundaries: np.ndarray, num_states: int) -> np.ndarray | None:
-    """Log weights (num_cells, num_states) that keep labelled boundaries [s] within a cell; None without any.
-
-    -inf where a label forbids a state, 0 elsewhere.
-    """
+    """Log weights (num_cells, num_states), 0 or -inf, that keep labels [s] within a cell; None without."""
     if not np.isfinite(boundaries).any():
         return None
     reach, out = trial.edges[1] - trial.edges[0], np.zeros((len(trial.middle), num_states))
@@ -238,10 +198,7 @@ def label_constraints(trial: SequenceFeatures, boundaries: np.ndarray, num_state
 
 def choose_detectors(taught: Learner, data: Sequence[SequenceFeatures], boundaries: Sequence[np.ndarray],
                      paths: Sequence[np.ndarray], temper: float, law: Chain) -> Detectors:  # fmt: skip
-    """Detectors whose window and weights place held-out labels best (leave-one-trial-out).
-
-    The score is the log probability within a cell of the label, which penalises overconfident weights.
-    """
+    """Detectors whose window and weights give held-out labels the highest log probability within a cell."""
     channels = [v[:, : v.shape[1] // 2] for v in taught.values]
     cells = [np.searchsorted(d.middle, b, side="right") - 1 for d, b in zip(data, boundaries, strict=True)]
     shown = [_shown(each) for each in cells]

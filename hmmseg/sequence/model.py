@@ -40,17 +40,13 @@ SQUEEZED = 0.03  # chosen: share of the typical duration
 
 @dataclass(frozen=True)
 class NamedCourse:
-    """A course (`hmmseg.sequence.courses`) on the fine grid, and which of its changes are the boundaries.
+    """A course (`hmmseg.sequence.courses`) on the fine grid, and which of its changes are the boundaries."""
 
-    `probability`: of the course; `naming` (num_boundaries, num_changes): that boundary b is change j, summing
-    to 1 over j; `shift` (num_boundaries, num_changes) [cells]: mean lag of labelled boundaries behind it.
-    """
-
-    probability: float
+    probability: float  # of the course
     emissions: StudentEmissions
     mean_cells: np.ndarray
-    naming: np.ndarray
-    shift: np.ndarray
+    naming: np.ndarray  # (num_boundaries, num_changes) probability that boundary b is change j
+    shift: np.ndarray  # (num_boundaries, num_changes) [cells] mean lag of labelled boundaries behind it
 
     def align(self, trial: SequenceFeatures) -> AlignmentPosterior:
         """Posterior alignment; InfeasibleAlignment for fewer cells than stretches."""
@@ -66,27 +62,22 @@ class SequenceModel(Tabled):
     Unlabelled trials may show one more state than the task names, the `settled` one: recordings run on after
     the last event, and what follows (decay, rest) belongs to the last subtask but looks different. Unless two
     trials are fully labelled, the model keeps several `courses`, and boundaries are mixtures over them.
-
-    Attributes:
-        mean_cells, presence: (num_states,) mean duration [cells], and probability of an optional state.
-        typical: (num_states,) median duration [cells] in the training trials.
-        usual_scores: (2, 2) median and width of the two scores of `misfit` in the training trials.
-        courses: alternative alignments, most probable first.
-        lag: (num_boundaries,) [cells] scale of the Laplace law of boundaries about their change.
-        sure: (num_boundaries,) probability that the boundaries of this model are the task's.
     """
 
     task: SequenceTask
     mapping: FeatureMap
     emissions: StudentEmissions
-    mean_cells: np.ndarray
-    presence: np.ndarray
+    mean_cells: np.ndarray  # (num_states,) mean duration [cells]
+    presence: np.ndarray  # (num_states,) probability of an optional state
     settled: bool
     detectors: Detectors | None
-    typical: np.ndarray
+    typical: np.ndarray  # (num_states,) median duration [cells] in the training trials
+    # (2, 2) median and width of the two scores of `misfit` in the training trials
     usual_scores: np.ndarray = field(default_factory=lambda: np.tile([0.0, np.inf], (2, 1)))
-    courses: tuple[NamedCourse, ...] = ()
+    courses: tuple[NamedCourse, ...] = ()  # alternative alignments, most probable first
+    # (num_boundaries,) [cells] scale of the Laplace law of boundaries about their change
     lag: np.ndarray = field(default_factory=lambda: np.empty(0))
+    # (num_boundaries,) probability that the boundaries of this model are the task's
     sure: np.ndarray = field(default_factory=lambda: np.empty(0))
 
     def tables(self) -> list[Table]:
@@ -106,14 +97,8 @@ class SequenceModel(Tabled):
         return align([ll], [chain])[0]
 
     def misfit(self, trial: SequenceFeatures) -> tuple[np.ndarray, np.ndarray, AlignmentPosterior]:
-        """How badly a trial fits, without boundary templates, which free switching has no counterpart of.
-
-        Evidence of models learned without labels is coarsened (`hmmseg.sequence.courses`).
-
-        Returns:
-            (2,) log evidence of free switching over forced order [nats], and minus log evidence per cell;
-            the log-likelihoods (num_cells, num_states); the alignment.
-        """
+        """How badly a trial fits without boundary templates: log evidence of free switching over forced order
+        [nats], minus log evidence per cell (2,); log-likelihoods; alignment. Unlabelled, it is coarsened."""
         model, temper = replace(self, detectors=None), self.emissions.temper
         if self.detectors is None:
             temper *= INDEPENDENT / (INDEPENDENT + temper * trial.values.size)
@@ -131,10 +116,7 @@ class SequenceModel(Tabled):
         return log_likelihoods, np.full(num_states, -np.log(num_states)), transition
 
     def failure(self, trial: SequenceFeatures) -> Failure | None:
-        """The first subtask at which a trial leaves the task; None where it fits.
-
-        The first subtask may be cropped to any length and is not tested for being squeezed.
-        """
+        """The first subtask at which a trial leaves the task, the first of all cropped or not; else None."""
         names, optional = self.task.sequence, optional_states(self.task, settled=False)
         scores, ll, alignment = self.misfit(trial)
         cells = alignment.smoothed.sum(axis=0)
@@ -160,10 +142,7 @@ def optional_states(task: SequenceTask, settled: bool) -> list[bool]:
 
 
 def usual_misfit(scores: Sequence[np.ndarray]) -> np.ndarray:
-    """Median and width (2, 2) of each score [(2,), ...] over the training trials.
-
-    The width is widened by 1 + FEW / their number, as that of few trials is uncertain itself.
-    """
+    """Median and width (2, 2) of each score [(2,), ...] over the training trials, wider if they are few."""
     center = np.median(scores, axis=0)
     width = NORMAL * np.median(np.abs(np.array(scores) - center), axis=0)
     return np.column_stack([center, np.maximum(width, LEAST_WIDTH) * (1 + FEW / len(scores))])
@@ -206,18 +185,7 @@ def save_model(model: SequenceModel, path: str | Path) -> None:
 
 
 def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
-    """Read a model.
-
-    Args:
-        path: a file written by `save_model`.
-        task: the task for which it was learned.
-
-    Returns:
-        The model.
-
-    Raises:
-        InputError: the file is no model, or was learned for another task.
-    """
+    """Read what `save_model` wrote; InputError if it is no model, or was learned for another task."""
     where, expected = str(path), "a model written by `hmmseg fit`"
     try:
         table = unpack(Path(path))

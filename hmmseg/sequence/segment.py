@@ -5,8 +5,6 @@ and their changes, weighted by the probabilities of the courses and that the bou
 shows which label would tell most.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -35,10 +33,9 @@ def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse],
         lag: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Mixture over all courses of `crossings` [(num_cells - 1, num_changes), ...], the posterior of each.
 
-    `lag` (num_boundaries,) [cells]. Returns the posterior (num_cells - 1, num_boundaries) of each boundary
-    at each cell edge, and the expected gain (num_boundaries,) [nats] of a label: the mutual information of
-    naming and label, which is the entropy of the mixture less the mean entropy of its components.
-    """
+    `lag` (num_boundaries,) [cells]. Returns the posterior (num_cells - 1, num_boundaries) of each boundary at
+    each cell edge, and the expected gain (num_boundaries,) [nats] of a label: the mutual information of
+    naming and label, which is the entropy of the mixture less the mean entropy of its components."""
     from scipy.ndimage import convolve1d, shift  # slow to import
 
     mixture, gain = [], []
@@ -64,11 +61,8 @@ def mix(crossings: Sequence[np.ndarray], courses: Sequence[NamedCourse],
 
 
 def places(edges: np.ndarray, crossing: np.ndarray, answer: float) -> tuple[Place, ...]:
-    """Places [s] of one boundary, most probable first; none where one of them is SURE.
-
-    `edges` (num_cells + 1,) [s]; `crossing` (num_cells - 1,): the boundary's probability at the inner ones;
-    `answer` [s]: the reported time, the first place. A place extends NEAR of the trial to either side.
-    """
+    """Places [s] of one boundary, most probable first; none where one is SURE. `crossing` (num_cells - 1,):
+    its probability at the inner `edges` (num_cells + 1,) [s]; `answer`: the first place."""
     inner, left = edges[1:-1], crossing / crossing.sum()
     reach = NEAR * (edges[-1] - edges[0])
     low = np.searchsorted(inner, inner - reach)
@@ -98,21 +92,9 @@ _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interva
 
 def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
                      model: SequenceModel | None = None) -> list[Segmentation]:  # fmt: skip
-    """Segment recordings of a plain ordered task.
-
-    Args:
-        trials: recordings.
-        task: the order of the subtasks.
-        model: from `fit_sequence`; by default learned from these trials themselves.
-
-    Returns:
-        One segmentation a trial. A trial that does not follow the task says so in `failed` and keeps its
-        spans. A skipped optional subtask has no span. Where trials can be read in several ways, spans have
-        `alternatives` and the segmentation a `question`.
-
-    Raises:
-        InputError: trials, task and model do not go together.
-    """
+    """Segment recordings of a plain ordered task, by a model of `fit_sequence` or one learned from these
+    trials. A skipped optional subtask has no span; where trials can be read in several ways, spans have
+    `alternatives` and a segmentation a `question`. InputError if trials, task and model do not fit."""
     if model is None:
         model = fit_sequence(trials, task)
     elif model.task.sequence != task.sequence:
@@ -189,8 +171,7 @@ def _jumps(trial: Trial, data: SequenceFeatures, model: SequenceModel, times: li
 
     The offset from a feature's change follows the Laplace law of `Weighing.lag`, NEAR at most; between jumps
     levels are constant with normal noise. All jumps are found jointly on the cells, as neighbours share
-    samples, and each is then refined between two samples.
-    """
+    samples, and each is then refined between two samples."""
     step, cells = model.mapping.step, len(data.values)
     farthest = max(round(NEAR * cells), 1)
     reach, channels = farthest + model.mapping.window, len(model.mapping.channels)
@@ -209,9 +190,7 @@ def _jumps(trial: Trial, data: SequenceFeatures, model: SequenceModel, times: li
 
 def _levels(x: np.ndarray, at: np.ndarray, farthest: int, lag: float, model: SequenceModel) -> np.ndarray:
     """The cells, each within `farthest` of its start in `at`, in which the level of `x` most likely changes.
-
-    `x` (num_cells, num_channels). A cell in which the level changes counts for neither side.
-    """
+    `x` (num_cells, num_channels). A cell in which the level changes counts for neither side."""
     there, x = _about_mean(x)
     sums = [np.concatenate([np.zeros((1, x.shape[1])), v.cumsum(axis=0)]) for v in (there, x, x**2)]
 
@@ -280,8 +259,7 @@ def _boundary(
 
     `probability` (num_cells - 1,) of the inner edges is spread evenly over one cell's width, and what is
     missing to 1 (a skipped subtask's boundary at the very start) lies at the first edge. Where the boundary
-    may lie in places far apart (`scattered`), the interval is the shortest, not that of equal tails.
-    """
+    may lie in places far apart (`scattered`), the interval is the shortest, not that of equal tails."""
     middle, inner = (edges[1:] + edges[:-1]) / 2, edges[1:-1]
     cumulative = np.r_[0.0, np.cumsum(probability)]
     total = max(cumulative[-1], np.finfo(float).tiny)

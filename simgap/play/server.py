@@ -4,8 +4,6 @@ Sixty times a second the physics advances by the elapsed milliseconds and the ne
 listens on the loopback interface only, and only one page of its own origin may open the socket.
 """
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import contextlib

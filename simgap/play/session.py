@@ -1,7 +1,5 @@
 """A session: one hand commands one or two worlds side by side, and is recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,9 +28,8 @@ LONGEST = 600.0  # limit: s of a recording
 def default_rig() -> Rig:
     """Fingertips on foam pads as in the included recordings, recorded without joints."""
     pads = {"normal_stiffness": 4000.0, "shear_stiffness": 2500.0}
-    return Rig.read(
-        {"rate": RATE, "fingertip": pads, "noise": {"position": 2e-5, "velocity": 3e-3, "force": 0.01}}
-    )
+    noise = {"position": 2e-5, "velocity": 3e-3, "force": 0.01}
+    return Rig.read({"rate": RATE, "fingertip": pads, "noise": noise})
 
 
 def default_task(objects: list[str]) -> BlockTask:
@@ -46,11 +43,9 @@ def default_task(objects: list[str]) -> BlockTask:
 
 
 class Session:
-    """The nominal world, optionally a second one, and the hand that both follow.
-
-    `aim` (the hand's middle, closed or open) or `touch` (each finger) sets the target, `advance` lets time
-    pass, `frame` gives the current state, and `save` writes what was recorded since `reset`.
-    """
+    """The nominal world, optionally a second one, and the hand that both follow. `aim` (the hand's middle,
+    closed or open) or `touch` (each finger) sets the target, `advance` lets time pass, `frame` gives the
+    current state, and `save` writes what was recorded since `reset`."""
 
     def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, seed: int = 0) -> None:
         self.task, self.rig, self.blocks, self.seed = task, rig, blocks, seed
@@ -108,9 +103,7 @@ class Session:
                 world.advance(self.command, self.rate)
             if self.nominal.t < LONGEST:
                 tips = self.nominal
-                self._rows.append(
-                    np.concatenate([tips.position.ravel(), tips.velocity.ravel(), tips.force.ravel()])
-                )
+                self._rows.append(np.concatenate([tips.position, tips.velocity, tips.force], axis=None))
 
     def _follow(self) -> None:
         """Let the command follow the mouse as a hand would: smoothly, with limited speed."""
@@ -152,11 +145,8 @@ class Session:
         return {"kind": "frame", "t": self.nominal.t, "command": self.command.tolist(), "worlds": worlds}
 
     def save(self, folder: Path) -> list[Path]:
-        """Save the nominal world's recording as the next trial_NN.csv, with rig, task and true properties.
-
-        ValueError if it is shorter than a second, InputError if the folder belongs to another session.
-        Existing files are never replaced.
-        """
+        """Save the nominal world's recording as the next trial_NN.csv, with rig, task and true properties,
+        replacing nothing. ValueError if shorter than a second, InputError in another session's folder."""
         rows = np.array(self._rows)
         if len(rows) < 1000:
             raise ValueError("less than a second has been recorded")

@@ -1,8 +1,6 @@
 """A played world: the virtual model with perceptible effects, and a hand on springs that follows a
 command."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
@@ -34,10 +32,7 @@ def felt_effects() -> dict[str, HandEffect]:
 
 
 def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[str, float]:
-    """Parameters of an effect, as given; by default those of its first form, strong enough to be felt.
-
-    InputError for an unknown effect.
-    """
+    """An effect's parameters, as given or strong enough to be felt; InputError for an unknown effect."""
     known = felt_effects()
     if name not in known:
         raise InputError(f"effect {name}", "cannot be felt in a played world", nearest(name, known))
@@ -50,8 +45,7 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
 
 
 def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, Surroundings]:
-    """Rig, blocks and surroundings under the scene effects among these, with pads stiff enough to be
-    played."""
+    """Rig, blocks and surroundings under the scene effects among these, with pads stiff enough to play."""
     hand, around, blocks = scene_of(rig, blocks, effects)
     stiff = {n: getattr(hand.fingertip, n) for n in ("normal_stiffness", "shear_stiffness")}
     pads = {n: float(np.clip(v, SOFTEST, finite_stiffness(np.inf))) for n, v in stiff.items()}
@@ -62,8 +56,7 @@ def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, 
 def sensed(
     effects: Values, t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig
 ) -> np.ndarray:
-    """Forces (n, 2, 2) [N] read by sensors with these effects, for a stretch of motion at times t (n,)
-    [s]."""
+    """Forces (n, 2, 2) [N] read by sensors with these effects, during a motion at times t (n,) [s]."""
     nothing, known = np.zeros(t.size), felt_effects()
     mine = {name: values for name, values in effects.items() if known[name].acts_on == "sensing"}
     truth = Performance(t, position, velocity, force, np.zeros(0), rig, nothing, nothing + 1.0)
@@ -78,9 +71,7 @@ WINDOW = 600  # look: ms of motion that a sensor effect can look back on
 
 class PlayedWorld:
     """Blocks and two fingertips; `advance` moves them by a millisecond under commanded finger positions.
-
-    `position`, `velocity`, `force` (2 fingers, 2 axes) [m, m/s, N] of the tips, forces on the blocks.
-    """
+    `position`, `velocity`, `force` (2 fingers, 2 axes) [m, m/s, N] of the tips, forces on the blocks."""
 
     def __init__(self, task: BlockTask, rig: Rig, blocks: Blocks, x: Mapping[str, float], start: np.ndarray,
                  effects: Values | None = None) -> None:  # fmt: skip

@@ -1,8 +1,6 @@
 """Figures of a diagnosis: from its JSON where the gap is, which causes are suspected and how far it shrinks;
 from the signals, the recorded, simulated and corrected course where they differ most."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,10 @@ def draw_all(
     body = found.body
     draw_heat_map(body, subtasks, path("gap_where.png"))
     draw_suspects(body, path("gap_probabilities.png"))
-    draw_signal(found, path("gap_signal.png"))
+    if isinstance(found, GenericDiagnosis):
+        _draw_mean_course(found, path("gap_signal.png"))
+    else:
+        _draw_trial(found, path("gap_signal.png"))
     if body.get("shrinkage") and body["shrinkage"].get("before") is not None:
         draw_how_far(body, path("gap_before_after.png"))
 
@@ -79,9 +80,8 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
             if share is not None and entry["probability"] >= 0.01:
                 ends = entry.get("interval_90") or (share, share)
                 axes.plot(ends, [k, k], color=RED, lw=1.4)
-                axes.plot(
-                    share, k, "o", color=RED, ms=4, label="share of the gap" if k == len(rows) - 1 else None
-                )
+                label = "share of the gap" if k == len(rows) - 1 else None
+                axes.plot(share, k, "o", color=RED, ms=4, label=label)
         axes.set_yticks(at, [plain_name(name) for name, _ in rows])
         axes.set(xlim=(0, 1.02))
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
@@ -89,8 +89,7 @@ def draw_suspects(body: Body, path: Path | None = None) -> Axes:
 
 
 def draw_how_far(body: Body, path: Path) -> None:
-    """Mean squared residual of held-out trials before and after correction, and that of healthy
-    recordings."""
+    """Mean squared residual of held-out trials before and after correction, and what healthy ones leave."""
     s = body["shrinkage"]
     with canvas(path, height=1.7) as figure:
         axes = figure.add_subplot()
@@ -116,14 +115,6 @@ def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
     if channel == "grip":
         return np.minimum(world.force[trial, :, 0], -world.force[trial, :, 2])
     return channels(world)[trial, :, list(CHANNELS).index(channel)]
-
-
-def draw_signal(found: Diagnosis | GenericDiagnosis, path: Path) -> None:
-    """Draw the signal with the largest excess, and its whitened residual beneath."""
-    if isinstance(found, GenericDiagnosis):
-        _draw_mean_course(found, path)
-    else:
-        _draw_trial(found, path)
 
 
 def _draw_trial(found: Diagnosis, path: Path) -> None:
@@ -160,8 +151,7 @@ def _draw_trial(found: Diagnosis, path: Path) -> None:
 
 
 def _draw_mean_course(found: GenericDiagnosis, path: Path) -> None:
-    """Draw the slow course with the largest excess in a subtask: real, simulated, with the effects
-    applied."""
+    """Draw the slow course with the largest excess in a subtask: real, simulated, corrected."""
     lay = found.scene.layout
     excess = (found.real.mean(0) - found.sim.mean(0)) ** 2 / found.variance
     t = (found.scene.bins[1:] + found.scene.bins[:-1]) / 2
@@ -237,19 +227,16 @@ def draw_course(one: Course, found: Robot, path: Path) -> None:
 
 
 def draw_before_after(found: RobotDiagnosis, path: Path) -> None:
-    """Root mean square residual by log before and after correction, cross-validated between logs if it
-    was."""
+    """Root mean square residual by log before and after correction, held out if it was cross-validated."""
     rows, both = found.composed.rows, residuals(found)
     logs = [r.name for r in found.composed.recordings]
     size = np.sqrt(rows.variance)
     at = np.arange(len(logs))
     with canvas(path, height=2.6) as figure:
         axes = figure.add_subplot()
-        for place, residual, colour, name in zip(
-            (-0.2, 0.2), both, (RED, BLUE), ("before", "after"), strict=True
-        ):
-            each = [np.sqrt(np.nanmean(((residual / size)[rows.log == k]) ** 2)) for k in at]
-            axes.bar(at + place, each, 0.4, color=colour, label=name)
+        for place, left, colour, how in zip((-0.2, 0.2), both, (RED, BLUE), ("before", "after"), strict=True):
+            each = [np.sqrt(np.nanmean(((left / size)[rows.log == k]) ** 2)) for k in at]
+            axes.bar(at + place, each, 0.4, color=colour, label=how)
         axes.axhline(1, color=GREY, lw=0.8, ls="--")
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")

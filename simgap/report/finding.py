@@ -133,11 +133,6 @@ def probability(body: Body) -> float:
     return float(body["probabilities"].get(name, 0.0))
 
 
-def sureness(p: float) -> str:
-    """A probability in words."""
-    return next(word for least, word in SURE if p >= least)
-
-
 def named(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The causes in plain words, with a robot's parameter values."""
     name = "+".join(body["causes"])
@@ -190,7 +185,8 @@ def sentences(body: Body) -> list[str]:
         text = f"Recording and model differ beyond noise ({p}); no known cause explains the larger part."
         return [text, *doubted(body), *moving(body)]
     chance = probability(body)
-    out = [f"{sureness(chance)[0].upper()}{sureness(chance)[1:]} ({percent(chance)})."]
+    word = next(word for least, word in SURE if chance >= least)
+    out = [f"{word.capitalize()} ({percent(chance)})."]
     if verdict == "set":
         others = ", or ".join(plain_name(n) for n in body["indistinguishable"])
         out.append(f"These recordings cannot tell it from {others}.")
@@ -284,10 +280,8 @@ def remains(body: Body) -> list[str]:
         return [f"Under 1 % of the gap remains{sure}, which is more than noise.{size}"]
     if _noise(rest):
         return [f"What remains, {percent(rest['share'])} of the gap, is within the noise{sure}.{size}"]
-    return [
-        f"{percent(rest['share'])} of the gap remains{sure}.{size}",
-        *moving({"where": rest.get("where") or []}, of="what remains"),
-    ]
+    return [f"{percent(rest['share'])} of the gap remains{sure}.{size}",
+            *moving({"where": rest.get("where") or []}, of="what remains")]  # fmt: skip
 
 
 def _noise(rest: Mapping[str, Any]) -> bool:
@@ -304,10 +298,8 @@ def settles(body: Body, weighed: bool) -> str:
     )
     if weighed or not unsure or not any(e.get("property_shift") for e in body["effects"].values()):
         return ""
-    return (
-        "Weigh and measure the blocks and pass them with --actual: a sensor error can hide in a "
-        "fitted weight or size."
-    )
+    return ("Weigh and measure the blocks and pass them with --actual: a sensor error can hide in a "
+            "fitted weight or size.")  # fmt: skip
 
 
 def chances(body: Body) -> dict[str, float]:

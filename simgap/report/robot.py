@@ -53,16 +53,15 @@ def own_units(loaded: Loaded | None) -> dict[str, Own]:
 
 @dataclass(frozen=True)
 class Course:
-    """A channel of a log (n,) at times `t` [s], in its column's unit: recorded, simulated by the original
-    model, and by the corrected one; NaN where a simulation restarts."""
+    """A channel of a log (n,) in its column's unit, NaN where a simulation restarts."""
 
     log: str
     channel: str
     unit: str
-    t: np.ndarray
+    t: np.ndarray  # [s]
     recorded: np.ndarray
-    simulated: np.ndarray
-    corrected: np.ndarray
+    simulated: np.ndarray  # by the original model
+    corrected: np.ndarray  # by the corrected one
     over: float  # mean square residual of the original model, in noise variances
 
 
@@ -110,8 +109,7 @@ def next_motion(document: Mapping[str, Any], logs: Iterable[Recording]) -> Recor
 def motion_csv(
     log: Recording, commands: Sequence[str], own: Mapping[str, Own], time: tuple[str, float]
 ) -> str:
-    """The commands of a motion as CSV in the columns' own units, to be run again; `time` is the name of the
-    time column and its unit [s]. As they were run before, they lie within the joints' limits."""
+    """The commands of a motion as CSV in the columns' own units; `time`: its column and unit [s]."""
     columns = [(log.t - log.t[0]) / time[1]]
     columns += [own[n].of(log[n]) if n in own else log[n] for n in commands]
     lines = [",".join((time[0], *commands))]
@@ -120,8 +118,7 @@ def motion_csv(
 
 
 def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Every parameter of a diagnosis by name: the calibrated ones, overridden by those of the named causes.
-    The values of a set's members are null."""
+    """Every parameter of a diagnosis by name: calibrated, or of the named causes; null of a set's members."""
     keys = ("mean", "sd", "interval_90", "unit")
     known = (document.get("calibrated") or {}).get("parameters") or {}
     out = {name: {k: p.get(k) for k in keys} for name, p in known.items()}
@@ -146,11 +143,7 @@ class _Run(BaseModel):
 
 
 def history(path: Path) -> list[dict[str, Any]]:
-    """The runs in a history file, one line of JSON each; none if there is no file.
-
-    Raises:
-        InputError: A line is not a run.
-    """
+    """The runs in a history file, one line of JSON each, none without a file; InputError if one is no run."""
     if not path.exists():
         return []
     out = []
@@ -190,11 +183,7 @@ def compared(
 
 
 def write_rerun(path: Path, found: Sequence[Course]) -> None:
-    """Write recorded, simulated and corrected courses of all logs and channels for Rerun's viewer.
-
-    Raises:
-        InputError: rerun-sdk is not installed.
-    """
+    """Write the courses of all logs and channels for Rerun's viewer; InputError without rerun-sdk."""
     try:
         rerun: Any = importlib.import_module("rerun")
     except ImportError:

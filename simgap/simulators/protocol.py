@@ -4,8 +4,6 @@ A simulator is any object with `parameters`, `channels` and `simulate`; it inher
 `parameters` and `channels` may hold plain dicts (`simgap.simulators.user` reads them).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,10 +23,8 @@ Channels = Mapping[str, np.ndarray]  # channel name -> (num_timesteps,)
 
 @dataclass(frozen=True)
 class Channel:
-    """One column of the logs: `unit`, standard deviation `noise` of one sample, `kind` (one of KINDS).
-
-    A command is given to the simulator and not compared. NaN noise is estimated from the recording.
-    """
+    """One column of the logs: `unit`, standard deviation `noise` of one sample (NaN: estimated from the
+    recording), `kind` (one of KINDS). A command is given to the simulator and not compared."""
 
     unit: str
     kind: str
@@ -63,8 +59,7 @@ class Simulator(Protocol):
     channels do not determine the state; `contacts(recording)` returns times [s] at which windows begin;
     `simulate_many(jobs)` runs several jobs at once, None for one that diverged; `numerics` names parameters
     of the solver rather than the robot; `window` [s] is how long it is run from one start, longer where
-    errors of a start die out.
-    """
+    errors of a start die out."""
 
     @property
     def parameters(self) -> Mapping[str, Parameter]: ...  # noqa: D102

@@ -21,16 +21,13 @@ from hmmseg.io.units import Column
 
 @dataclass(frozen=True)
 class Recording:
-    """Times `t` (num_timesteps,) [s] and `columns` by name, from row `first` of a whole log.
-
-    NaN is a missing sample. `recording["q1"]` is a column; `warnings` tell what was left out of its file.
-    """
+    """A log, or a window of one; NaN is a missing sample, and `recording["q1"]` a column."""
 
     name: str
-    t: np.ndarray
-    columns: Mapping[str, np.ndarray]
-    first: int = 0
-    warnings: tuple[str, ...] = ()
+    t: np.ndarray  # (num_timesteps,) [s]
+    columns: Mapping[str, np.ndarray]  # by name
+    first: int = 0  # row of the whole log
+    warnings: tuple[str, ...] = ()  # what was left out of its file
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]
@@ -52,24 +49,10 @@ def read_recording(
     path: Path, wanted: Iterable[str], times: str = "t", unit: float = 1.0, commands: Collection[str] = (),
     acts: str | None = None,
 ) -> Recording:  # fmt: skip
-    """Read the columns that a simulator needs from a file of any kind.
-
-    Columns that come at rates of their own, in rows of their own, are brought to the rows of the fastest.
-
-    Args:
-        path: The file.
-        wanted: Names of its columns.
-        times: The column of times.
-        unit: Its unit [s].
-        commands: Columns that are held from sample to sample.
-        acts: Name of a column to add where rows differ in when their commands were given: these times [s].
-
-    Returns:
-        The recording.
-
-    Raises:
-        InputError: A column is missing, a cell is no number, or the clock goes back or has another unit.
-    """
+    """Read the columns `wanted` from a file of any kind. Columns at rates of their own are brought to the
+    rows of the fastest, `commands` as held from sample to sample; `unit` [s] is that of the column `times`.
+    `acts`: name of a column to add of the times [s] from which commands acted, where these differ. InputError
+    for a column that is missing or no number, or a clock that goes back or has another unit."""
     names = tuple(dict.fromkeys(wanted))
     clock = {"t": Column.model_validate({"from": times, "unit": unit})}
     rig = Rig.model_construct(columns=clock, topics=clock if times != "t" else {})
@@ -91,8 +74,7 @@ def _on_one_clock(log: Recording, commands: Collection[str], acts: str | None) -
 
     Slower columns are interpolated like topics of a log, at the rows nearest to their own samples: more would
     count noise twice. Commands count with their mean until the next row; or, where all are given together and
-    at most once a row, as they are, from when they were given.
-    """
+    at most once a row, as they are, from when they were given."""
     rows = {name: np.flatnonzero(np.isfinite(values)) for name, values in log.columns.items()}
     if all(np.median(np.diff(each)) <= 1 for each in rows.values() if each.size > 1):
         return log

@@ -4,8 +4,6 @@ A user's code runs within `calling`, and what it returns is checked by `Checks`:
 is one line that names its file and line.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import inspect
@@ -52,18 +50,8 @@ class UserSimulator:
 
 
 def load_simulator(spec: str) -> UserSimulator:
-    """Load a simulator from a user's Python file.
-
-    Args:
-        spec: `FILE.py:NAME`; the name is of an object, a class (made without arguments) or a function with
-            attributes `parameters` and `channels`.
-
-    Returns:
-        The simulator, with all calls checked.
-
-    Raises:
-        InputError: The file or the name is missing, its code fails, or what it declares cannot be used.
-    """
+    """Load the simulator `FILE.py:NAME`, an object, a class (made without arguments) or a function with
+    attributes, all calls checked; InputError if it is missing, fails, or declares what cannot be used."""
     file, _, name = spec.rpartition(":")
     where = f"--simulator {spec}"
     if not file or not name.isidentifier():
@@ -93,11 +81,8 @@ class _Late(BaseException):
 
 @contextmanager
 def calling(where: str, file: str, expected: str = "", patience: float = PATIENCE) -> Iterator[None]:
-    """Run a user's code: whatever it raises becomes an InputError with the line of its `file`.
-
-    So does a call of more than `patience` [s], where it runs Python in the main thread of a POSIX system. An
-    interrupt stays one.
-    """
+    """Run a user's code: whatever it raises becomes an InputError with the line of its `file`, except for an
+    interrupt. So does more than `patience` [s] in the main thread of a POSIX system."""
     timed = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
 
     def late(*_: Any) -> None:
@@ -134,16 +119,12 @@ def _line(error: BaseException, where: str, file: str) -> str:
 
 @dataclass(frozen=True)
 class Checks:
-    """Checked calls of a user's functions.
+    """Checked calls of a user's functions."""
 
-    `where` they are named, their `file`, `patience` [s] with a call, and the `channels` that a run must
-    return.
-    """
-
-    where: str
+    where: str  # they are named
     file: str
-    patience: float
-    channels: tuple[str, ...]
+    patience: float  # [s] with a call
+    channels: tuple[str, ...]  # that a run must return
 
     def call(self, function: Callable[..., Any], *args: Any) -> Any:
         """Call a function."""

@@ -1,7 +1,5 @@
 """Animation of fingers and blocks beside their force traces, as a GIF or an MP4."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,9 +85,8 @@ def _draw_scene(stage, scene: Scene):
     left, right = scene.motion.position[..., 0].min(), scene.motion.position[..., 0].max()
     near = 100 * seen[(seen[:, 0] > left - 0.1) & (seen[:, 0] < right + 0.1)]  # without far blocks
     (left, _), (right, top) = near.min(axis=0), near.max(axis=0)
-    stage.set(
-        xlim=(left - 2, right + 2), ylim=(-0.4, top + 2), aspect="equal", xlabel="x [cm]", ylabel="y [cm]"
-    )
+    stage.set(xlim=(left - 2, right + 2), ylim=(-0.4, top + 2), aspect="equal")
+    stage.set(xlabel="x [cm]", ylabel="y [cm]")
     stage.axhline(0.0, color=INK, lw=1.0)
     bodies = []
     for k, (name, block) in enumerate(scene.blocks.items()):

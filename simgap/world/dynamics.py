@@ -9,8 +9,6 @@ the same code is mapped over trials.
 Units: m, s, N, kg, rad. x right, y up; finger 0 is the left one and pushes right.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from functools import partial
@@ -30,13 +28,9 @@ FADE = 2e-5  # numerics: m; depth over which damping fades in, so that an impact
 
 
 def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) -> Array:
-    """Normal force [N] of a spring that only pushes, 0 out of contact.
-
-    `depth` [m] is positive inside, `rate` [m/s] is its time derivative. A Kelvin-Voigt element whose damping
-    [N s/m] fades in with depth, as in Hunt & Crossley, "Coefficient of restitution interpreted as damping in
-    vibroimpact", J. Appl. Mech. 42 (1975): constant damping would make the force jump at touch and pull at
-    separation.
-    """
+    """Normal force [N] of a spring that only pushes, at `depth` [m] inside. Its damping [N s/m] fades in with
+    depth, as in Hunt & Crossley, J. Appl. Mech. 42 (1975): constant damping would make the force jump at
+    touch and pull at separation."""
     depth = jnp.maximum(depth, 0.0)
     faded = damping * jnp.minimum(depth / FADE, 1.0)
     return jnp.maximum(stiffness * depth + faded * rate, 0.0)
@@ -44,14 +38,9 @@ def normal_force(stiffness: Array, damping: Array, depth: Array, rate: Array) ->
 
 def friction(stiffness: Array, damping: Array, deflection: Array, rate: Array,
              bound: Array) -> tuple[Array, Array]:  # fmt: skip
-    """Tangential force [N] and the remaining elastic deflection [m], by return mapping.
-
-    The contact sticks through a spring from its anchor: a constant load below `bound` (friction coefficient
-    times normal force) holds at a constant deflection forever. Beyond the bound the anchor is dragged along
-    so that the spring carries exactly the bound (elastic predictor and return mapping: Simo & Hughes,
-    Computational Inelasticity, 1998, chapter 1; the contact model of Cundall & Strack, Géotechnique 29,
-    1979). Without contact the deflection is 0.
-    """
+    """Tangential force [N] and the remaining elastic deflection [m]: the contact sticks through a spring from
+    its anchor, which beyond `bound` is dragged along (return mapping: Simo & Hughes, Computational
+    Inelasticity, 1998, chapter 1; Cundall & Strack, Géotechnique 29, 1979)."""
     limit = bound / stiffness
     deflection = jnp.clip(deflection, -limit, limit)
     return jnp.clip(stiffness * deflection + damping * rate, -bound, bound), deflection
@@ -64,34 +53,24 @@ EDGE = 1e-3  # numerics: m; length over which a contact fades at the end of a fa
 
 
 class Physics(NamedTuple):
-    """All constants of a scene, a pytree of scalars; effects and gradients act on it.
+    """All constants of a scene, a pytree of scalars; effects and gradients act on it."""
 
-    Per block: `weight` [N], `width`, `height` [m] and `friction` against a pad. Per finger:
-    `pad_normal`, `pad_shear` [N/m]. `pad_time` [s] is damping over stiffness of the foam.
-    Supports (ground and block on block): `support_stiffness` [N/m] along and across,
-    `support_damping` (ratio to critical) and `support_friction`. `tilt` [rad] inclines the ground.
-    """
-
-    weight: Scalars
-    width: Scalars
-    height: Scalars
-    friction: Scalars
-    pad_normal: Scalars
-    pad_shear: Scalars
-    pad_time: Scalar
-    support_stiffness: Scalar
-    support_damping: Scalar
+    weight: Scalars  # [N] per block
+    width: Scalars  # [m]
+    height: Scalars  # [m]
+    friction: Scalars  # against a pad
+    pad_normal: Scalars  # [N/m] per finger
+    pad_shear: Scalars  # [N/m]
+    pad_time: Scalar  # [s] the foam's damping over its stiffness
+    support_stiffness: Scalar  # [N/m] of ground and blocks, along and across
+    support_damping: Scalar  # ratio to critical
     support_friction: Scalar
     gravity: Scalar
-    tilt: Scalar
+    tilt: Scalar  # [rad] of the ground
 
 
 class State(NamedTuple):
-    """Centres and velocities of the blocks (num_blocks each), and the anchors of all contacts.
-
-    Anchors are the relative tangential positions [m] at which a contact carries no shear: `pads` (2 x
-    num_blocks), `ground` (num_blocks) and `pairs` (one per pair of blocks).
-    """
+    """Blocks' centres and velocities, and anchors of contacts: relative positions [m] without shear."""
 
     x: Scalars
     y: Scalars
@@ -99,7 +78,7 @@ class State(NamedTuple):
     vy: Scalars
     pads: tuple[Scalars, Scalars]
     ground: Scalars
-    pairs: Scalars
+    pairs: Scalars  # one per pair of blocks
 
 
 class Tips(NamedTuple):
@@ -112,35 +91,29 @@ class Tips(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Forces [N]: `fx`, `fy` exerted by each finger, `block_x`, `block_y` net on each block, `pads` the
-    normal force of each finger on each block, `support` the force from beneath each block."""
+    """Forces [N]."""
 
-    fx: Scalars
-    fy: Scalars
-    block_x: Scalars
-    block_y: Scalars
-    pads: tuple[Scalars, Scalars]
-    support: Scalars
+    fx: Scalars  # exerted by each finger
+    fy: Scalars  # likewise
+    block_x: Scalars  # net on each block
+    block_y: Scalars  # likewise
+    pads: tuple[Scalars, Scalars]  # normal, of each finger on each block
+    support: Scalars  # from beneath each block
 
 
 Values = Any  # a jax Array in compiled code, a NumPy array after it
 
 
 class Record(NamedTuple):
-    """A rollout, one row per control period; F fingers (2), B blocks.
+    """A rollout, one row per control period; F fingers (2), B blocks."""
 
-    Tips: `position`, `velocity`, `force` (T, F, 2) [m, m/s, N], x and y last. Blocks: `blocks` and
-    `block_velocity` (T, B, 2) [m, m/s]. Normal forces `pads` (T, F, B) [N], forces from beneath `support`
-    (T, B) [N].
-    """
-
-    position: Values
-    velocity: Values
-    force: Values
-    blocks: Values
-    block_velocity: Values
-    pads: Values
-    support: Values
+    position: Values  # (T, F, 2) [m] of the tips
+    velocity: Values  # (T, F, 2) [m/s]
+    force: Values  # (T, F, 2) [N]
+    blocks: Values  # (T, B, 2) [m]
+    block_velocity: Values  # (T, B, 2) [m/s]
+    pads: Values  # (T, F, B) [N] normal forces
+    support: Values  # (T, B) [N] from beneath
 
 
 def tips_of(row: Array) -> Tips:
@@ -187,8 +160,7 @@ def resting_state(physics: Physics, x: Sequence[Scalar], y: Sequence[Scalar]) ->
 
 
 def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
-    """Contact forces in a configuration, and the state with the anchors of slipping contacts dragged
-    along."""
+    """Contact forces in a configuration, and the state with the anchors of slipping contacts dragged on."""
     n = len(state.x)
     force_x: list[Scalar] = [0.0] * n
     force_y: list[Scalar] = [-w for w in physics.weight]
@@ -222,8 +194,7 @@ def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
         support[i] += jnp.maximum(fy, 0.0)
         support[j] += jnp.maximum(-fy, 0.0)
         anchors.append(anchor)
-    mapped = state._replace(pads=(tuple(pads[0]), tuple(pads[1])), ground=tuple(ground),
-                            pairs=tuple(anchors))  # fmt: skip
+    mapped = state._replace(pads=(tuple(pads[0]), tuple(pads[1])), ground=tuple(ground), pairs=tuple(anchors))
     return mapped, Loads(tuple(tip_x), tuple(tip_y), tuple(force_x), tuple(force_y),
                          (tuple(normals[0]), tuple(normals[1])), tuple(support))  # fmt: skip
 
@@ -250,12 +221,9 @@ def kick(physics: Physics, state: State, loads: Loads, h: Scalar) -> State:
 
 
 def substep(physics: Physics, state: State, tips: Tips, h: Scalar) -> State:
-    """One step of h [s], with the tips given at its middle: half drift, kick, half drift.
-
-    The position form of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical Integration,
-    2006, section I.1): second order, symplectic without dissipation, one force evaluation per step. Stable
-    for h times the fastest frequency below 2.
-    """
+    """One step of h [s], with the tips given at its middle: half drift, kick, half drift. The position form
+    of the Störmer-Verlet scheme (Hairer, Lubich & Wanner, Geometric Numerical Integration, 2006, section
+    I.1), stable for h times the fastest frequency below 2."""
     state, loads = interact(physics, drift(state, h / 2), tips)
     return drift(kick(physics, state, loads, h), h / 2)
 
@@ -320,8 +288,7 @@ def _ground_depth(physics: Physics, state: State, i: int) -> tuple[Scalar, Scala
 
 
 def _ground(physics: Physics, state: State, i: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Forces fx, fy on a block [N], their normal part, and the new anchor [m] of its contact with the
-    ground."""
+    """Forces fx, fy of the ground on a block [N], their normal part, and the new anchor [m]."""
     depth, rate = _ground_depth(physics, state, i)
     damping = _damping(physics, physics.weight[i])
     push = normal_force(physics.support_stiffness, damping, depth, rate)
@@ -372,9 +339,7 @@ def _damping(physics: Physics, weight: Scalar) -> Scalar:
 # from commanding positions beyond the contact.
 
 CONTROL_PERIOD = 1e-3  # numerics: s; between commands, and between records
-BUCKET = (
-    4000  # numerics: control periods; commands are padded to multiples of it, so few programs are compiled
-)
+BUCKET = 4000  # numerics: control periods; commands are padded to its multiples, so few programs are compiled
 
 
 class Impedance(NamedTuple):
@@ -387,10 +352,7 @@ class Impedance(NamedTuple):
 
 @partial(jax.jit, static_argnames=("substeps",))
 def perform(physics: Physics, hand: Impedance, command: Array, state: State, substeps: int) -> Record:
-    """Perform a commanded motion: `command` (T, 4) is x1, y1, x2, y2 [m] per control period.
-
-    Tips start at rest at the first command. Commands are interpolated linearly.
-    """
+    """Perform `command` (T, 4), x1, y1, x2, y2 [m] per control period, joined by lines, from rest."""
     h = CONTROL_PERIOD / substeps
     slope = jnp.diff(command, axis=0, append=command[-1:]) / CONTROL_PERIOD
     start = tips_of(jnp.concatenate([command[0], jnp.zeros(4)]))

@@ -6,8 +6,6 @@ commands beyond a contact into grip and pressing. Motions are minimum-jerk (Flas
 physiological tremor lies at 6-12 Hz.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator
 
 from hmmseg.io.rig import Rig
-from hmmseg.io.schema import Finite, FinitePositive, StrictTable, read_json, read_toml, validated
+from hmmseg.io.schema import Finite, FinitePositive, StrictTable, read_json, read_toml
 from hmmseg.io.task import BlockTask, Move
 from simgap.world.dynamics import CONTROL_PERIOD
 from simgap.world.properties import Blocks, Tabletop, lay_out
@@ -48,8 +46,7 @@ class OperatorSettings(StrictTable):
 
     Times [s], lengths [m], forces [N]; `pace` divides all durations. Drawn once per trial: the hand's
     `hand_stiffness` [N/m], `hand_mass` [kg] and `hand_damping` (ratio), the `offset` between the fingers'
-    heights, and the rms `tremor` and `wander` of each tip.
-    """
+    heights, and the rms `tremor` and `wander` of each tip."""
 
     grip: Above = (2.0, 3.2)
     press: Range = (0.9, 1.9)
@@ -84,7 +81,7 @@ def read_operator(path: str | Path) -> OperatorSettings:
     """Settings from a TOML or JSON file: [low, high] or one number per name; InputError if invalid."""
     json = Path(path).suffix.lower() == ".json"
     table = read_json(path, "operator settings") if json else read_toml(path)
-    return validated(OperatorSettings, table, str(path))
+    return OperatorSettings.validated(table, str(path))
 
 
 @dataclass(frozen=True)
@@ -102,17 +99,13 @@ class Window:
 
 @dataclass(frozen=True)
 class Plan:
-    """Commanded tips (num_periods, 4): x1, y1, x2, y2 [m], one row per control period.
+    """One performance as it is commanded."""
 
-    `impedance` of the hand is (mass [kg], stiffness [N/m], damping [N s/m]), `start` the initial centre of
-    every block [m], `duration` [s] of the trial.
-    """
-
-    command: np.ndarray
-    impedance: tuple[float, float, float]
-    start: dict[str, tuple[float, float]]
+    command: np.ndarray  # (num_periods, 4) tips x1, y1, x2, y2 [m], one row per control period
+    impedance: tuple[float, float, float]  # of the hand: mass [kg], stiffness [N/m], damping [N s/m]
+    start: dict[str, tuple[float, float]]  # initial centre of every block [m]
     windows: tuple[Window, ...]
-    duration: float
+    duration: float  # [s] of the trial
 
 
 def minimum_jerk(phase: np.ndarray) -> np.ndarray:
@@ -204,8 +197,7 @@ class _Performer:
         return start + duration / 2, start + duration
 
     def _carry(self, move: Move, start: float, grasp: float) -> tuple[float, float]:
-        """Lift a block, carry it over its destination and press it down; the times [s] midway and at the
-        end."""
+        """Lift a block, carry it over its destination and press it down; the times [s] midway and then."""
         block, before = self.blocks[move.object], self.table.centre(move.object)
         target = self.table.carry(move, self.draw("misplacement"))
         rest, rise = self.table.centre(move.object), self.draw("rise")
@@ -241,14 +233,12 @@ def plan(task: BlockTask, rig: Rig, blocks: Blocks, settings: OperatorSettings,
     offset, tremor, wander = (performer.draw(name) for name in ("offset", "tremor", "wander"))
     tips = np.stack([x - gap / 2, y - offset / 2, x + gap / 2, y + offset / 2], 1)
     for k in range(4):
-        tips[:, k] += _oscillation(t, TREMOR_BAND, tremor, rng) + _oscillation(t, WANDER_BAND, wander, rng)
+        tips[:, k] += _sway(t, TREMOR_BAND, tremor, rng) + _sway(t, WANDER_BAND, wander, rng)
     damping = 2 * performer.draw("hand_damping") * np.sqrt(performer.stiffness * performer.mass)
     return Plan(tips, (performer.mass, performer.stiffness, damping), start, windows, duration)
 
 
-def _oscillation(
-    t: np.ndarray, band: tuple[float, float], rms: float, rng: np.random.Generator
-) -> np.ndarray:
+def _sway(t: np.ndarray, band: tuple[float, float], rms: float, rng: np.random.Generator) -> np.ndarray:
     """Narrow-band motion [m] (T,) of a given rms: sinusoids of random frequency and phase."""
     count = 6
     frequency, phase = rng.uniform(*band, (count, 1)), rng.uniform(0, 2 * np.pi, (count, 1))

@@ -1,7 +1,5 @@
 """Blocks of a virtual scene (given, read from a file or drawn at random) and the tabletop they stand on."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from copy import deepcopy
@@ -60,11 +58,9 @@ def blocks_table(blocks: Blocks) -> Table:
 
 
 def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
-    """Read blocks from an `actual.toml` or from the JSON of `identify`; InputError if invalid.
-
-    Values are `value` or `mean`. Friction is used if its mean is known; a lower bound alone raises the
-    default to at least the bound. A property that could not be identified is refused.
-    """
+    """Read blocks from an `actual.toml` or from the JSON of `identify`; InputError if invalid. Values are
+    `value` or `mean`. Friction is used if its mean is known; a lower bound alone raises the default to at
+    least the bound. A property that could not be identified is refused."""
     path = Path(path)
     if path.suffix.lower() == ".json":
         table = read_json(path, "identify's JSON or an actual.toml").get("properties")
@@ -72,9 +68,7 @@ def read_properties(path: str | Path, task: BlockTask) -> dict[str, Block]:
             raise InputError(f"{path}: key properties", "missing", "the JSON of identify")
     else:
         measured = read_actual(path, task.objects)
-        table = {
-            name: {key: value for key, (value, _) in entries.items()} for name, entries in measured.items()
-        }
+        table = {name: {key: v for key, (v, _) in entries.items()} for name, entries in measured.items()}
     return blocks_of(table, task, str(path))
 
 
@@ -127,11 +121,8 @@ def standing_heights(on: Mapping[str, str], heights: Mapping[str, float]) -> dic
 
 
 class Tabletop:
-    """Where every block stands; updated by each planned move.
-
-    `x` [m] are the blocks' centres, `on` what each stands on, `spot` the place (index into `spots`) of the
-    lowest block of each pile.
-    """
+    """Where every block stands; updated by each planned move. `x` [m] are the blocks' centres, `on` what each
+    stands on, `spot` the place (index into `spots`) of the lowest block of each pile."""
 
     def __init__(self, task: BlockTask, blocks: Blocks, spots: np.ndarray, piles: Mapping[str, int]) -> None:
         self.blocks, self.spots = blocks, spots

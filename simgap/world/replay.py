@@ -1,7 +1,5 @@
 """Replay: the finger motions of a recording drive the virtual model, which predicts forces and blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -12,7 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.special import gammaincinv
 
 from hmmseg.hand.signals import Signals, task_space
-from hmmseg.io.rig import Rig
+from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import GROUND, BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.jaxconfig import double_precision
@@ -37,16 +35,12 @@ AGREEMENT = 1.5  # chosen: standard deviations within which a wider window must 
 
 @dataclass(frozen=True)
 class Motion:
-    """Smoothed motion of several axes at times `t` (T,) [s].
+    """Smoothed motion of several axes."""
 
-    `position`, `velocity` (T, axes) [m, m/s], and the position's `sd` (T, axes) [m], inf where a gap in the
-    samples was only interpolated.
-    """
-
-    t: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    sd: np.ndarray
+    t: np.ndarray  # (T,) [s]
+    position: np.ndarray  # (T, axes) [m]
+    velocity: np.ndarray  # (T, axes) [m/s]
+    sd: np.ndarray  # (T, axes) [m] of the position, inf where a gap was only interpolated
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (len(times), axes): cubic between samples, at rest beyond them."""
@@ -57,10 +51,7 @@ class Motion:
 
 def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_position: np.ndarray,
            sd_velocity: np.ndarray) -> Motion:  # fmt: skip
-    """Smooth samples (T, axes) of position [m] and velocity [m/s], NaN where missing.
-
-    `sd_*` (T, axes) is the noise of one sample.
-    """
+    """Smooth position [m] and velocity [m/s] (T, axes), NaN where missing, with noise `sd_*` of a sample."""
     weights = [np.where(np.isfinite(z), 1.0 / (TOLERANCE * sd), 0.0)
                for z, sd in ((position, sd_position), (velocity, sd_velocity))]  # fmt: skip
     samples = [np.nan_to_num(position), np.nan_to_num(velocity)]
@@ -87,11 +78,9 @@ def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_positio
 
 def _windows(t: np.ndarray, samples: list[np.ndarray], weights: list[np.ndarray], before: int,
              after: int) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Fit a parabola about every sample, over the given numbers of samples before and after it.
-
-    Returns position, velocity and variance (T, axes, 3) at the sample, and whether the data accept the window
-    (T, axes). A window with one neighbour is always accepted: there is no narrower one.
-    """
+    """Fit a parabola about every sample, over the given numbers of samples before and after it. Returns
+    position, velocity and variance (T, axes, 3) at the sample, and whether the data accept the window (T,
+    axes). A window with one neighbour is always accepted: there is no narrower one."""
     n = t.size
     rows = np.arange(n)[:, None] + np.arange(-before, after + 1)
     inside = (rows >= 0) & (rows < n)
@@ -133,17 +122,13 @@ TO_TIPS = np.linalg.inv(TO_MEAN)
 
 @dataclass(frozen=True)
 class Replay:
-    """Predictions for one recording; T samples, 2 fingers, axes x and y last.
-
-    `force` (T, 2, 2) [N] is predicted at the samples, `measured` (T, 2, 2) [N] recorded; `motion` is the
-    whole rollout at 1 kHz, at times `t` [s].
-    """
+    """Predictions for one recording; T samples, 2 fingers, axes x and y last."""
 
     signals: Signals
-    force: np.ndarray
-    measured: np.ndarray
-    t: np.ndarray
-    motion: Record
+    force: np.ndarray  # (T, 2, 2) [N] predicted at the samples
+    measured: np.ndarray  # (T, 2, 2) [N]
+    t: np.ndarray  # [s] of the rollout, at 1 kHz
+    motion: Record  # the whole rollout
 
     @property
     def predicted(self) -> dict[str, np.ndarray]:
@@ -161,10 +146,7 @@ class Replay:
 def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
            boundaries: Sequence[float] | np.ndarray | None = None, surroundings: Surroundings | None = None,
            ) -> Replay:  # fmt: skip
-    """Drive the calibrated model with the motion of a recording.
-
-    `boundaries` [s] between the subtasks locate the blocks; without them the trial is segmented.
-    """
+    """Drive the calibrated model with a recording's motion; its `boundaries` [s] place the blocks."""
     signals = task_space(trial, rig)
     if boundaries is None:
         found = segment([trial], task, rig)[0]
@@ -179,12 +161,8 @@ def replay(trial: Trial, task: BlockTask, rig: Rig, blocks: Blocks, *,
     motion = rollout(constants, start, *moved, CONTROL_PERIOD, substeps_for(constants, CONTROL_PERIOD))
     motion = jax.tree.map(lambda a: np.asarray(a)[: t.size], motion)
     force = interpolated(signals.t, t, motion.force)
-    return Replay(signals, force, _forces(signals).reshape(-1, 2, 2), t, motion)
-
-
-def _forces(signals: Signals) -> np.ndarray:
-    """Measured forces fx1, fy1, fx2, fy2 (T, 4) [N]."""
-    return np.stack([signals.fx1, signals.fy1, signals.fx2, signals.fy2], 1)
+    measured = np.stack([getattr(signals, name) for name in FORCE_CHANNELS], 1)
+    return Replay(signals, force, measured.reshape(-1, 2, 2), t, motion)
 
 
 def finger_motion(signals: Signals) -> Motion:
@@ -192,10 +170,8 @@ def finger_motion(signals: Signals) -> Motion:
     s, scale = signals, np.sqrt([1.0, 1.0, 4.0, 4.0])  # sd_* are those of a mean; differences have twice them
     position = np.stack([s.x, s.y, s.distance, s.offset], 1)
     velocity = np.stack([s.vx, s.vy, s.vx2 - s.vx1, s.vy2 - s.vy1], 1)
-    sd_position, sd_velocity = (
-        np.stack(sds * 2, 1) * scale for sds in ([s.sd_x, s.sd_y], [s.sd_vx, s.sd_vy])
-    )
-    return smooth(s.t, position, velocity, sd_position, sd_velocity)
+    sd_position, sd_rate = (np.stack(sds * 2, 1) * scale for sds in ([s.sd_x, s.sd_y], [s.sd_vx, s.sd_vy]))
+    return smooth(s.t, position, velocity, sd_position, sd_rate)
 
 
 def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarray) -> dict[str, float]:
@@ -229,11 +205,8 @@ def places(signals: Signals, path: Motion, task: BlockTask, boundaries: np.ndarr
 def residual_summary(
     result: Replay, boundaries: Sequence[float] | np.ndarray, states: Sequence[str]
 ) -> dict[str, float]:
-    """Root mean square of the net force residual over its noise, by contact state.
-
-    `states` are those of the subtasks between the `boundaries` [s]; samples within 0.1 s of a boundary are
-    left out. The noise of a net force is sqrt(2) times the sensor's.
-    """
+    """Root mean square of the net force residual over its noise, sqrt(2) times the sensor's, by contact
+    state; samples within 0.1 s of a boundary [s] are left out."""
     t, net = result.signals.t, result.residual.sum(axis=1) / (np.sqrt(2) * result.signals.sd_force)
     edges = np.concatenate([[t[0] - 1], boundaries, [t[-1] + 1]])
     inside = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, len(states) - 1)

@@ -1,7 +1,5 @@
 """Synthetic trials: an operator performs a task, sensors record it, and contacts give the truth."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,17 +23,8 @@ from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS, Trial
 from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.spans import Segmentation, known, spans_table
 from hmmseg.tables import Tabled
-from simgap.world.dynamics import (
-    BUCKET,
-    CONTROL_PERIOD,
-    Impedance,
-    Physics,
-    Record,
-    State,
-    interpolated,
-    perform,
-    resting_state,
-)
+from simgap.world import dynamics
+from simgap.world.dynamics import CONTROL_PERIOD, Physics, Record, State
 from simgap.world.operator import OperatorSettings, Plan, Window, plan
 from simgap.world.properties import UNITS, Blocks, blocks_table
 from simgap.world.virtual_model import Surroundings, physics, substeps_for
@@ -50,11 +39,9 @@ DEFAULT_CARTESIAN_VELOCITY = 0.004  # prior: m/s
 
 def record(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, force: np.ndarray, rig: Rig,
            rng: np.random.Generator | None, file: str) -> Trial:  # fmt: skip
-    """Record tips (num_timesteps, 2 fingers, 2 axes) at times t (num_timesteps,) [s].
-
-    Positions [m], velocities [m/s], forces [N] on the environment. Noise as in the rig is drawn from `rng`
-    (none if None). InputError if a tip is beyond the hand's reach.
-    """
+    """Record tips (num_timesteps, 2 fingers, 2 axes) at times t (num_timesteps,) [s]. Positions [m],
+    velocities [m/s], forces [N] on the environment. Noise as in the rig is drawn from `rng` (none if None).
+    InputError if a tip is beyond the hand's reach."""
     channels: dict[str, np.ndarray] = {}
 
     def take(name: str, values: np.ndarray, quantity: str) -> None:
@@ -136,12 +123,9 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
                     operator: OperatorSettings | None = None, surroundings: Surroundings | None = None,
                     alter: Callable[[Plan, np.random.Generator], Plan] | None = None,
                     ) -> list[SimulatedTrial]:  # fmt: skip
-    """Several performances of a task, one for each seed with its blocks of known properties.
-
-    They are integrated together, which costs far less than one after another, with the same result. `alter`
-    changes the operator's commands, given a random generator of its own. InputError if a block is missing or
-    out of the hand's reach.
-    """
+    """Several performances of a task, one for each seed with its blocks, integrated together, which costs
+    less and changes nothing. `alter` changes the operator's commands, given a random generator of its own.
+    InputError if a block is missing or out of reach."""
     settings = operator or OperatorSettings()
     if not seeds:
         return []
@@ -155,7 +139,7 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
         plans = [alter(p, np.random.default_rng([seed, 4])) for p, seed in zip(plans, seeds, strict=True)]
     scenes = [physics(rig, [blocks[name] for name in task.objects], surroundings) for blocks in properties]
     substeps = max(substeps_for(scene, CONTROL_PERIOD) for scene in scenes)
-    length = -(-max(len(p.command) for p in plans) // BUCKET) * BUCKET
+    length = -(-max(len(p.command) for p in plans) // dynamics.BUCKET) * dynamics.BUCKET
     trials = []
     for k in range(0, len(plans), BATCH):
         batch = range(k, min(k + BATCH, len(plans)))
@@ -168,7 +152,7 @@ def simulate_trials(task: BlockTask, rig: Rig, properties: Sequence[Blocks], see
 def _perform_all(task: BlockTask, plans: Sequence[Plan], scenes: Sequence[Physics], length: int,
                  substeps: int) -> list[Record]:  # fmt: skip
     """Records of one batch, padded to 1, SMALL or BATCH trials so that three programs serve all sizes."""
-    hands = [Impedance(*map(jnp.asarray, p.impedance)) for p in plans]
+    hands = [dynamics.Impedance(*map(jnp.asarray, p.impedance)) for p in plans]
     commands = [np.pad(p.command, ((0, length - len(p.command)), (0, 0)), "edge") for p in plans]
     starts = [_start(scene, task, p) for scene, p in zip(scenes, plans, strict=True)]
     rows = list(zip(scenes, hands, commands, starts, strict=True))
@@ -181,14 +165,14 @@ def _perform_all(task: BlockTask, plans: Sequence[Plan], scenes: Sequence[Physic
 
 @partial(jax.jit, static_argnames=("substeps",))
 def _perform_batch(
-    scenes: Physics, hands: Impedance, commands: Array, starts: State, substeps: int
+    scenes: Physics, hands: dynamics.Impedance, commands: Array, starts: State, substeps: int
 ) -> Record:
-    return jax.vmap(partial(perform, substeps=substeps))(scenes, hands, commands, starts)
+    return jax.vmap(partial(dynamics.perform, substeps=substeps))(scenes, hands, commands, starts)
 
 
 def _start(scene: Physics, task: BlockTask, performance: Plan) -> State:
     x, y = zip(*(performance.start[name] for name in task.objects), strict=True)
-    return resting_state(scene, [jnp.asarray(v) for v in x], [jnp.asarray(v) for v in y])
+    return dynamics.resting_state(scene, [jnp.asarray(v) for v in x], [jnp.asarray(v) for v in y])
 
 
 def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks: Blocks,
@@ -199,7 +183,8 @@ def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks:
     fine = np.arange(n) * CONTROL_PERIOD
     rate = rig.rate or DEFAULT_RATE
     t = np.arange(int(round(performance.duration * rate, 6))) / rate
-    place, speed, force = (interpolated(t, fine, z) for z in (motion.position, motion.velocity, motion.force))
+    moved = motion.position, motion.velocity, motion.force
+    place, speed, force = (dynamics.interpolated(t, fine, z) for z in moved)
     trial = record(t, place, speed, force, rig, np.random.default_rng([seed, 2]), f"simulated, seed {seed}")
     order = {name: k for k, name in enumerate(task.objects)}
     truth = [time for w in performance.windows for time in _boundaries(w, order[w.object], fine, motion)]
@@ -207,8 +192,7 @@ def _trial(task: BlockTask, rig: Rig, performance: Plan, motion: Record, blocks:
 
 
 def _boundaries(window: Window, block: int, t: np.ndarray, motion: Record) -> list[float]:
-    """The four times [s] of a move: both fingers touch, it leaves (or slides), meets (or stops), one lets
-    go."""
+    """The four times [s] of a move: both fingers touch, it leaves (slides), meets (stops), one lets go."""
     gripped = (motion.pads[:, :, block] > 0).all(axis=1)
     early, late = (t >= window.lift) & (t < window.middle), (t >= window.middle) & (t < window.end)
     if window.slide:
@@ -236,10 +220,7 @@ DIGITS = {"q": 6, "d": 5, "x": 7, "y": 7, "v": 6, "f": 5}  # numerics: decimals 
 
 
 def scene_files(task: BlockTask, rig: Rig, blocks: Blocks) -> dict[str, str]:
-    """Contents of rig.toml, task.toml and actual.toml by file name.
-
-    Trials have the fingertips' own columns, in SI units, whatever those of the rig's recordings are.
-    """
+    """Contents of rig.toml, without the columns of its recordings, task.toml and actual.toml by file name."""
     actual = {
         name: {key: {"unit": unit, "value": float(getattr(blocks[name], key))} for key, unit in UNITS.items()}
         for name in task.objects
@@ -257,8 +238,7 @@ def trial_files(number: int, trial: Trial, boundaries: np.ndarray, seed: int) ->
 
 
 def trial_csv(trial: Trial) -> str:
-    """A trial as CSV: t and the hand's channels, rounded below the sensors' noise; missing samples are
-    empty."""
+    """A trial as CSV: t and the hand's channels, rounded below their noise; missing samples are empty."""
     rows = [f"{t:.6f}" for t in trial.t]
     for name, values in trial.channels.items():
         digits = DIGITS[name[0]]

@@ -4,8 +4,6 @@
 haptic loop.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -45,17 +43,13 @@ RIGID_PAD = 1e5  # numerics: N/m in place of inf: 3 N of grip compress such a pa
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a rig does not state: supports and the foam's damping.
+    """What a rig does not state: supports and the foam's damping."""
 
-    Supports are stiff springs [N/m] with damping (ratio to critical for one block) and friction. The foam's
-    damping is given by `pad_time` [s], damping over stiffness, and the ground's slope by `tilt` [rad].
-    """
-
-    support_stiffness: float = 4e5
-    support_damping: float = 0.5
+    support_stiffness: float = 4e5  # [N/m]
+    support_damping: float = 0.5  # ratio to critical for one block
     support_friction: float = 0.5
-    pad_time: float = 2e-3
-    tilt: float = 0.0
+    pad_time: float = 2e-3  # [s] damping over stiffness of the foam
+    tilt: float = 0.0  # [rad] of the ground
 
 
 def physics(rig: Rig, blocks: Sequence[Block], surroundings: Surroundings | None = None) -> Physics:
@@ -74,12 +68,9 @@ def finite_stiffness(stiffness: float) -> float:
 
 
 def substeps_for(constants: Physics, period: float) -> int:
-    """Number of substeps in a period [s] that keeps the integration well inside its stability limit.
-
-    By Gershgorin's theorem no block oscillates faster than sqrt((4 supports + both pads) / mass), the bound
-    in the middle of a stack. The step is at most 1.1 over that frequency (the limit is 2), 0.8 over the pads'
-    damping rate, and 0.25 ms. The number is a power of two, so that few programs are compiled.
-    """
+    """Number of substeps, a power of two, in a period [s], well inside the stability limit. By Gershgorin's
+    theorem no block oscillates faster than sqrt((4 supports + both pads) / mass): the step is at most 1.1
+    over that (the limit is 2), 0.8 over the pads' damping rate, and 0.25 ms."""
     step = 2.5e-4
     pads = max(sum(map(float, constants.pad_normal)), sum(map(float, constants.pad_shear)))
     for w in constants.weight:
@@ -105,8 +96,7 @@ def advance(constants: Physics, state: State, before: Tips, after: Tips, dt: Sca
 @partial(jax.jit, static_argnames=("substeps",))
 def rollout(constants: Physics, state: State, positions: Array, velocities: Array, dt: Scalar,
             substeps: int) -> Record:  # fmt: skip
-    """Rollout from `state` as fingers move through positions and velocities (T, 2, 2) [m, m/s] every dt
-    [s]."""
+    """Rollout from `state` as fingers move through positions, velocities (T, 2, 2) [m, m/s] every dt [s]."""
 
     def one(carry: tuple[State, Tips], row: Array) -> tuple[tuple[State, Tips], Array]:
         state, before = carry
@@ -206,9 +196,8 @@ def _program(num_blocks: int, substeps: int) -> Callable:
     block = [Block(1.0, 1.0, 1.0)] * num_blocks
     template = physics(Rig(), block)
     _, constants_of = ravel_pytree(template)
-    _, state_of = ravel_pytree(
-        resting_state(template, [jnp.zeros(())] * num_blocks, [jnp.zeros(())] * num_blocks)
-    )
+    nowhere = [jnp.zeros(())] * num_blocks
+    _, state_of = ravel_pytree(resting_state(template, nowhere, nowhere))
 
     def program(constants: Array, flat: Array, before: Array, after: Array, dt: Array) -> tuple[Array, Array]:
         scene, tips = constants_of(constants), tips_of(after)

@@ -111,9 +111,8 @@ def test_help_groups_commands_and_gives_examples(capsys):
 def test_a_process_with_a_bug_shows_its_traceback(task):
     code = """if True:
         import sys
-        import hmmseg.contact.decompose
-        from hmmseg_cli import main
-        hmmseg.contact.decompose.decompose = lambda task: 1 / 0
+        from hmmseg_cli import describe, main
+        describe.decompose_task = lambda task: 1 / 0
         sys.exit(main.main(["decompose", sys.argv[1]]))
     """
     done = subprocess.run([sys.executable, "-c", code, task], capture_output=True, text=True, check=False)

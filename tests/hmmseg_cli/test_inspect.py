@@ -235,7 +235,7 @@ def test_new_fills_in_a_rig_from_a_recording(tmp_path, capsys):
 
 
 def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
-    from simgap.simulators.mjcf.map import read_map
+    from simgap.simulators.mjcf.map import Map
 
     (tmp_path / "robot.xml").write_text(
         '<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size=".1"/></body></worldbody>'
@@ -248,7 +248,7 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
     given = ["--mjcf", str(tmp_path / "robot.xml"), "--from", str(tmp_path / "log.csv")]
     assert main(["new", str(tmp_path), *given]) == 0
     assert "columns left to you: room" in " ".join(capsys.readouterr().out.split())
-    found = read_map(tmp_path / "map.toml")
+    found = Map.from_toml(tmp_path / "map.toml")
     assert {n: (m.thing, m.kind) for n, m in found.columns.items()} == {
         "elbow_deg": ("joint", "position"), "elbow_vel": ("joint", "velocity"),
         "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force"),

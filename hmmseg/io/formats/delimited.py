@@ -6,8 +6,6 @@ comment may be the header; a row of units may follow the header. A truncated las
 zero bytes at the end, which recorders leave when they are interrupted.
 """
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator, Sequence
@@ -31,10 +29,7 @@ COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of one text file; line numbers count from 0.
-
-    `most`: cells of the longest row, of which those beyond the names are empty. `notes`: what was dropped.
-    """
+    """The layout of one text file; line numbers count from 0."""
 
     encoding: str
     separator: str
@@ -43,8 +38,8 @@ class Layout:
     units: dict[str, str]
     skipped: frozenset[int]
     rows: np.ndarray
-    most: int
-    notes: tuple[str, ...]
+    most: int  # cells of the longest row; those beyond the names are empty
+    notes: tuple[str, ...]  # what was dropped
 
 
 def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
@@ -170,11 +165,7 @@ def rows_in(path: Path, layout: Layout) -> Iterator[tuple[int, list[str]]]:
 
 
 def header_of(line: str, comments: Sequence[str], separator: str) -> list[str] | None:
-    """The header, if a comment holds it (as `numpy.savetxt` writes it) and `line` is the first row of
-    numbers.
-
-    Comment signs before its first name are not part of the name.
-    """
+    """The header, if a comment holds it, as of `numpy.savetxt`, and `line` is the first row of numbers."""
     cells = cells_of(line, separator)
     if not _numeric(cells):
         return None

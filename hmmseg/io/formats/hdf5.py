@@ -4,8 +4,6 @@ A column's name is its path below the demonstration, `obs/robot0_eef_pos[0]`. Ro
 is computed from `control_freq` in the file's `env_args` if present.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path

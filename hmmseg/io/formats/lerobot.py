@@ -6,8 +6,6 @@ A folder's episodes are its recordings, `dataset#3`. Entries of a feature have t
 at each sample.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -102,8 +100,7 @@ def texts_by_style(table: pa.Table) -> dict[str, np.ndarray]:
 
 
 def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, str]]]) -> pa.Table:
-    """A table of samples with these subtasks [(start in s, name), ...] by episode added to its language
-    rows."""
+    """A table of samples with these subtasks [(start in s, name), ...] by episode in its language rows."""
     fields = [("role", pa.string(), False), ("content", pa.string(), True), ("style", pa.string(), True)]
     more = [("camera", pa.string(), True), ("tool_calls", pa.list_(pa.string()), True)]
     episodes = table.column(EPISODE).to_numpy()

@@ -14,8 +14,6 @@ Files are read from the beginning, without index, summary or metadata.yaml: an u
 far as it goes, with a note. Topics of unknown types are left out, likewise.
 """
 
-from __future__ import annotations
-
 import bz2
 import dataclasses
 import json
@@ -47,18 +45,14 @@ Message = tuple[str, int, Callable[[], Any]]  # topic, when it was logged [ns si
 
 @dataclass
 class Stream:
-    """Messages of one topic while they are read: times [ns since 1970] and flat fields.
-
-    `stamped` is 0 for a message without a stamp; `failed` counts those that could not be decoded, with the
-    `reason` of the first.
-    """
+    """Messages of one topic while they are read."""
 
     topic: str
-    logged: list[int] = field(default_factory=list)
-    stamped: list[int] = field(default_factory=list)
-    values: list[dict[str, float]] = field(default_factory=list)
-    failed: int = 0
-    reason: str = ""
+    logged: list[int] = field(default_factory=list)  # [ns since 1970]
+    stamped: list[int] = field(default_factory=list)  # [ns since 1970], 0 without a stamp
+    values: list[dict[str, float]] = field(default_factory=list)  # flat fields
+    failed: int = 0  # messages that could not be decoded
+    reason: str = ""  # of the first of these
 
     def add(self, logged: int, decode: Callable[[], Any]) -> None:
         """Keep one message, or the reason why it cannot be decoded."""
@@ -81,8 +75,7 @@ class Stream:
         return list(dict.fromkeys(name for each in self.values for name in each))
 
     def columns(self, by_header: bool) -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
-        """Columns named by the same messages: distinct increasing times (num_messages,) [ns], and values
-        (num_messages,) by name."""
+        """Columns named by the same messages: distinct increasing times (num_messages,) [ns], values."""
         times = np.array(self.stamped if by_header else self.logged, dtype=np.int64)
         where: dict[str, list[int]] = {}
         for i, each in enumerate(self.values):
@@ -219,9 +212,7 @@ def _bag_messages(file: BufferedIOBase, path: Path, notes: list[str]) -> Iterato
     for head, data in _records(file):
         kind = head[b"op"]
         if kind == b"\x03" and head.get(b"index_pos") == bytes(8):
-            notes.append(
-                f"{path}: has no index: the recording was not finished; it is read as far as it goes"
-            )
+            notes += [f"{path}: has no index: the recording was not finished; it is read as far as it goes"]
         inside = [(head, data)] if kind != b"\x05" else _records(_decompress(head, data))
         for inner, content in inside:
             if inner[b"op"] == b"\x07":
@@ -333,11 +324,9 @@ def join_streams(
 
 
 def _clock_of(file: str, used: Sequence[Stream]) -> tuple[bool, list[str]]:
-    """Whether the headers' stamps are of one clock, and a note if they are of several.
-
-    Messages of one recorder are logged by one clock, soon after they are stamped. Their stamps lag by much
-    the same, even if they count from another zero (simulated time).
-    """
+    """Whether the headers' stamps are of one clock, and a note if they are of several. Messages of one
+    recorder are logged by one clock, soon after they are stamped. Their stamps lag by much the same, even if
+    they count from another zero (simulated time)."""
     if not all(all(stream.stamped) for stream in used):
         return False, []
     late = {s.topic: np.quantile(np.array(s.logged) - np.array(s.stamped), [0.05, 0.5, 0.95]) for s in used}
@@ -354,10 +343,8 @@ def _clock_of(file: str, used: Sequence[Stream]) -> tuple[bool, list[str]]:
 
 
 def interpolated(ticks: np.ndarray, times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values at the ticks (num_ticks,), NaN in gaps, and which of them lie between two messages.
-
-    `ticks` and `times` are in ns (or s), increasing; NaN among `values` (num_messages,) are skipped.
-    """
+    """Values at the ticks (num_ticks,), NaN in gaps, and which of them lie between two messages. `ticks` and
+    `times` are in ns (or s), increasing; NaN among `values` (num_messages,) are skipped."""
     there = np.isfinite(values)
     times, values = times[there], values[there]
     if not times.size:

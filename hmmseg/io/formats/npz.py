@@ -1,7 +1,5 @@
 """NumPy archives: one array per column, without pickled objects or arrays larger than they claim."""
 
-from __future__ import annotations
-
 import math
 import zipfile
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Parquet files, read column by column with pyarrow."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Usual sizes are shares of what the robot shows along the logs; torques are from 
 smoothed motion.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -34,14 +32,7 @@ from simgap.simulators.mjcf.setting import (
     setting_of,
     strength_of,
 )
-from simgap.simulators.mjcf.transmission import (
-    SHARE,
-    Motion,
-    elasticity,
-    motion_of,
-    periods,
-    sizes_of,
-)
+from simgap.simulators.mjcf.transmission import SHARE, Motion, elasticity, motion_of, periods, sizes_of
 from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
@@ -56,7 +47,9 @@ def offered(
     """Set the simulator's parameters, and return the candidates beyond them."""
     motions = [motion_of(simulator, log) for log in recordings]
     catalogue = _Catalogue(simulator)
-    joints = catalogue.driven_joints()
+    m, read = simulator.model, simulator.joints.values()
+    moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in (HINGE, SLIDE) and name_of(m, "joint", j)]
+    joints = [j for j in moving if j in read]
     catalogue.add_joints(joints, motions)
     catalogue.add_ties()
     catalogue.add_actuators()
@@ -91,12 +84,6 @@ class _Catalogue:
         self.settings[name] = setting
         self.parameters[name] = Parameter(nominal, float(sd), setting.unit, min(low, nominal), high, effect)
         self.says[effect or name] = says or f"{name} is not as the model has it"
-
-    def driven_joints(self) -> list[int]:
-        """Named hinges and slides that are read as joints."""
-        m, read = self.model, self.simulator.joints.values()
-        moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in (HINGE, SLIDE) and name_of(m, "joint", j)]
-        return [j for j in moving if j in read]
 
     def add_joints(self, joints: Sequence[int], motions: Sequence[Motion]) -> None:
         """Friction, rotor inertia and stiffness of joints; friction by load, speed, direction; and drag."""
@@ -134,8 +121,7 @@ class _Catalogue:
                 self.add(wave.name, 0.5 * near, says, often - near, often + near, effect, wave)
 
     def add_ties(self) -> None:
-        """How softly joints follow those that equalities tie them to: MuJoCo's default is softer than any
-        linkage."""
+        """How softly joints follow those they are tied to: by default softer than any linkage."""
         m = self.model
         for k in tied(m):
             name, soft = name_of(m, "joint", int(m.eq_obj1id[k])), float(m.eq_solref[k, 0])
@@ -175,9 +161,7 @@ class _Catalogue:
                     self._add_mass(tool)
                 self._add_payload(name if name in self.simulator.map.payload_at else name_of(m, "body", tool))
             first = int(m.body_jntadr[b])
-            chained = (
-                m.body_jntnum[b] and int(m.jnt_type[first]) in (HINGE, SLIDE) and m.body_parentid[b] != 0
-            )
+            chained = m.body_jntnum[b] and int(m.jnt_type[first]) in (HINGE, SLIDE) and m.body_parentid[b]
             if chained and np.linalg.norm(m.body_pos[b]) > 1e-6:
                 self.add(f"body:{name}.length", 0.01, f"length of the link before {name}", low=-0.5)
 
@@ -291,9 +275,7 @@ def _touching(simulator: MjcfSimulator, recordings: Sequence[Recording]) -> list
     """The geoms that touch most along the recorded motion, those of moving bodies first."""
     if not simulator.touching:
         return []
-    count = Counter(
-        g for log in recordings for pairs in simulator.touched(log) for pair in pairs for g in pair
-    )
+    count = Counter(g for log in recordings for pairs in simulator.touched(log) for p in pairs for g in p)
     moving = {int(simulator.model.jnt_bodyid[j]) for j in (*simulator.free, *simulator.joints.values())}
     ranked = sorted(count, key=lambda g: (int(simulator.model.geom_bodyid[g]) not in moving, -count[g]))
     return ranked[:GEOMS]

@@ -1,7 +1,5 @@
 """MuJoCo, whose bindings have no types for a checker; its warnings are counted."""
 
-from __future__ import annotations
-
 import importlib
 from collections import Counter
 from typing import Any

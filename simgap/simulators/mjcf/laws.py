@@ -39,15 +39,12 @@ class _Friction:
 
 @dataclass(frozen=True)
 class Laws:
-    """Laws that act in a model.
+    """Laws that act in a model."""
 
-    `friction`: of joints; `fading`: by drive the actuator, the fade over its largest force, the joint's
-    number, and its torque by a unit force; `uneven`: by joint the numbers of coordinate and velocity, the
-    periods per turn, both amplitudes, and whether they multiply the motor's torque.
-    """
-
-    friction: tuple[_Friction, ...]
+    friction: tuple[_Friction, ...]  # of joints
+    # by drive: actuator, fade over its largest force, the joint's number, its torque by a unit force
     fading: tuple[tuple[int, float, int, float], ...]
+    # by joint: coordinate, velocity, periods per turn, both amplitudes, whether of the motor's torque
     uneven: tuple[tuple[int, int, float, float, float, bool], ...]
 
     def __bool__(self) -> bool:
@@ -84,17 +81,7 @@ class Laws:
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Run a model with laws.
-
-    Args:
-        model, data: MuJoCo's.
-        laws: What acts.
-        first: Full states (B, size) to run from.
-        control: Controls (B, steps, actuators).
-
-    Returns:
-        Sensors (B, steps, sensors), as of `mujoco.rollout`.
-    """
+    """Sensors (B, steps, sensors) of a model with laws, from states (B, size) under controls."""
     out = np.empty((*control.shape[:2], model.nsensordata))
     plain, nu, step = np.array(model.dof_frictionloss), model.nu, mujoco.mj_step
     # Plain numbers and views of memory, several times as fast as elements and rows of arrays.

@@ -1,7 +1,5 @@
 """A MuJoCo model and its map, read and checked: the simulator, its logs, its candidates."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
@@ -14,28 +12,18 @@ import numpy as np
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.units import UNITS, known_unit, unwrapped
 from simgap.robot_effects.base import RobotEffect
+from simgap.simulators.mjcf import setting
 from simgap.simulators.mjcf.catalogue import offered
 from simgap.simulators.mjcf.engine import FREE, HINGE, JOINT, SLIDE, mujoco
-from simgap.simulators.mjcf.map import POSE, Map, Mapped, read_map
+from simgap.simulators.mjcf.map import POSE, Map, Mapped
 from simgap.simulators.mjcf.model import MjcfSimulator, ties
-from simgap.simulators.mjcf.setting import (
-    compiled,
-    follows_rates,
-    name_of,
-    names_of,
-    object_id,
-    only_slides,
-    setting_of,
-    turns,
-)
 from simgap.simulators.protocol import Channel
 from simgap.simulators.recording import Recording, held, read_recording
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A model to compare logs with. `simulator` has no parameters until `effects` has seen logs; `digest`: a
-    hash of model and map."""
+    """A model to compare logs with, without parameters until `effects` has seen logs; `digest`: its hash."""
 
     simulator: MjcfSimulator
     map: Map
@@ -55,9 +43,7 @@ class Loaded:
         for name, mapped in columns.items():
             if mapped.kind == "command":  # a drive holds it until the next
                 values[name] = held(values[name])
-            elif (
-                mapped.thing == "joint" and mapped.kind == "position" and _turns(self.simulator.model, mapped)
-            ):
+            elif mapped.kind == "position" and _turns(self.simulator.model, mapped):
                 wrapped, values[name] = values[name], unwrapped(values[name])
                 if not np.array_equal(wrapped, values[name], equal_nan=True):
                     warnings.append(f"{path}: column {name} jumps by whole turns, which were taken out")
@@ -70,30 +56,18 @@ class Loaded:
         return replace(log, warnings=tuple(warnings))
 
     def effects(self, recordings: Sequence[Recording]) -> list[RobotEffect]:
-        """Candidates that need the logs. Those that the model can be set to become parameters of the
-        simulator; the others are returned."""
+        """Candidates that need the logs: the simulator gets new parameters, and the others are returned."""
         return offered(self.simulator, recordings, self.candidates)
 
 
 def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Loaded:
-    """Read and check a model and its map.
-
-    Args:
-        xml: The MJCF or URDF file.
-        map_file: Its map (TOML).
-        candidates: Names of further settings to offer as causes.
-
-    Returns:
-        The simulator, and how logs are read for it.
-
-    Raises:
-        InputError: MuJoCo does not read the model, or the map or a candidate names what the model lacks.
-    """
+    """Read and check a model and its map, with names of further settings to offer as causes; InputError if
+    MuJoCo does not read it, or a name is not in the model."""
     if not xml.is_file():
         raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
     if xml.suffix.lower() == ".mjb":
         raise InputError(f"--mjcf {xml}", "is compiled: no sensor can be added", "its MJCF or URDF file")
-    described = read_map(map_file)
+    described = Map.from_toml(map_file)
     try:
         spec = mujoco.MjSpec.from_file(str(xml))
         plain = spec.compile()
@@ -111,28 +85,28 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
             raise InputError(f"{map_file}: {key}", f"the model has no {kind} {name}", nearest(name, known))
 
     for column, m in described.columns.items():
-        check(f"columns.{column}", m.thing, m.name, names_of(plain, m.thing))
+        check(f"columns.{column}", m.thing, m.name, setting.names_of(plain, m.thing))
         if m.thing == "joint" and int(plain.joint(m.name).type.item()) not in (HINGE, SLIDE):
             raise InputError(f"{map_file}: columns.{column}.joint", f"{m.name} is no hinge or slide",
                              "the seven columns of its body's pose")  # fmt: skip
     if described.keyframe is not None:
-        check("keyframe", "keyframe", described.keyframe, names_of(plain, "key"))
+        check("keyframe", "keyframe", described.keyframe, setting.names_of(plain, "key"))
     for name in candidates:
-        setting_of(plain, name)
+        setting.setting_of(plain, name)
     for body, place in described.payload_at.items():
-        check(f"payload_at.{body}", "body", body, names_of(plain, "body"))
+        check(f"payload_at.{body}", "body", body, setting.names_of(plain, "body"))
         if isinstance(place, str):
-            check(f"payload_at.{body}", "site", place, names_of(plain, "site"))
+            check(f"payload_at.{body}", "site", place, setting.names_of(plain, "site"))
     address = _add_sensors(spec, described.columns)
     # Else centres of mass could not be moved in the compiled model. Only of what is simple MuJoCo leaves the
     # rotor out where it reckons how softly ties and friction hold it.
     for body in spec.bodies:
         if hasattr(body, "simple"):
-            body.simple = only_slides(plain, body.id)
+            body.simple = setting.only_slides(plain, body.id)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if not np.any((plain.geom_contype != 0) | (plain.geom_conaffinity != 0)):
         spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT  # an eighth of a small robot's time
-    model = compiled(spec)
+    model = setting.compiled(spec)
     simulator, warnings = _simulator(model, described, str(map_file), address)
     simulator.spec = spec
     if xml.suffix.lower() == ".urdf" and not model.nu:
@@ -144,8 +118,7 @@ def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Load
 
 
 def _add_motors(spec: Any, columns: Mapping[str, Mapped], file: str) -> None:
-    """Add to a model without actuators, such as a URDF, a motor for every joint whose torque a column
-    commands, under the joint's name."""
+    """Add to a model without actuators, such as a URDF, motors for the joints whose torque is commanded."""
     for column, m in columns.items():
         if m.thing == "sensor" or m.kind not in ("command", "force", "torque"):
             continue
@@ -154,9 +127,8 @@ def _add_motors(spec: Any, columns: Mapping[str, Mapped], file: str) -> None:
             raise InputError(where, f"the model has no actuator to give a {m.kind}", motor)
         if spec.joint(m.name) is None:
             known = [joint.name for joint in spec.joints]
-            raise InputError(
-                where, f"the model has no actuator, and no joint {m.name}", nearest(m.name, known)
-            )
+            problem = f"the model has no actuator, and no joint {m.name}"
+            raise InputError(where, problem, nearest(m.name, known))
         if UNITS.get(known_unit(str(m.unit)) or "", ("",))[0] not in ("torque", "force"):
             servo = f'an MJCF with <position joint="{m.name}" kp=".." kv=".."/>, or a torque: {motor}'
             raise InputError(where, "the model has no servo to be commanded", servo)
@@ -209,20 +181,20 @@ def _simulator(
         _check_unit(f"{file}: columns.{column}.unit", m, unit)
         channels[column] = Channel(unit, m.kind, m.sd)
         if m.kind == "command":
-            driven[column] = object_id(model, "actuator", m.name)
+            driven[column] = setting.object_id(model, "actuator", m.name)
             continue
         sensor, at = address[column]
-        number = object_id(model, "sensor", sensor)
+        number = setting.object_id(model, "sensor", sensor)
         if at >= model.sensor_dim[number]:
             raise InputError(f"{file}: columns.{column}.axis", f"sensor {m.name} has no {m.axis}")
         sensors[column] = int(model.sensor_adr[number]) + at
         if m.thing == "joint" and m.kind == "position":
-            joints[column] = object_id(model, "joint", m.name)
+            joints[column] = setting.object_id(model, "joint", m.name)
         if m.thing == "body":
             poses.setdefault(m.name, {})[m.axis] = column
     free = {}
     for name, pose in poses.items():
-        first = int(model.body_jntadr[object_id(model, "body", name)])
+        first = int(model.body_jntadr[setting.object_id(model, "body", name)])
         if first < 0 or int(model.jnt_type[first]) != FREE:
             continue
         if len(pose) == len(POSE):
@@ -233,13 +205,12 @@ def _simulator(
                             "the model has it")  # fmt: skip
     known = {*joints.values(), *(joint for joint, _, _ in ties(model, [*joints.values()]))}
     moving = np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist()
-    if unseen := [name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
-        warnings.append(
-            f"{file}: no column shows {', '.join(unseen)}, which the model moves as it runs freely"
-        )
+    if unseen := [setting.name_of(model, "joint", j) or f"joint {j}" for j in moving if j not in known]:
+        names = ", ".join(unseen)
+        warnings.append(f"{file}: no column shows {names}, which the model moves as it runs freely")
     idle = [i for i in range(model.nu) if i not in driven.values()]
     if idle:
-        names = ", ".join(name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
+        names = ", ".join(setting.name_of(model, "actuator", i) or f"actuator {i}" for i in idle)
         warnings.append(f"{file}: no column drives {names}; they are left at zero or the keyframe")
     touching = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT
     whole = {name: pose for name, pose in poses.items() if len(pose) == len(POSE)}
@@ -261,9 +232,10 @@ def _unit(model: Any, m: Mapped) -> str:
         return next(name for name, (of, size) in UNITS.items() if of == what and size == 1.0)
     if m.thing in ("body", "site"):
         return "1" if m.axis.startswith("q") else "m"
+    turning = _turns(model, m)
     if m.thing == "actuator":
-        return READ[m.thing, m.kind][1 if turns(model, object_id(model, "actuator", m.name)) else 2]
-    return READ[m.thing, m.kind][1 if _turns(model, m) else 2]
+        turning = setting.turns(model, setting.object_id(model, "actuator", m.name))
+    return READ[m.thing, m.kind][1 if turning else 2]
 
 
 def _check_unit(where: str, m: Mapped, si: str) -> None:
@@ -298,11 +270,10 @@ def _check_ranges(model: Any, columns: Mapping[str, Mapped], log: Recording, fil
 
 
 def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
-    """InputError where a servo's goals are its joint's angles or rates in other units; units are never
-    guessed."""
+    """InputError where a servo's goals are its joint's in other units; units are never guessed."""
     model, seen = simulator.model, {j: c for c, j in simulator.joints.items()}
     for column, a in simulator.driven.items():
-        joint, per = int(model.actuator_trnid[a, 0]), "/s" if follows_rates(model, a) else ""
+        joint, per = int(model.actuator_trnid[a, 0]), "/s" if setting.follows_rates(model, a) else ""
         servo = int(model.actuator_trntype[a]) == JOINT and (per or model.actuator_biasprm[a, 1] < 0)
         if not servo or joint not in seen or int(model.jnt_type[joint]) != HINGE:
             continue

@@ -15,18 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import (
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    WrapValidator,
-    field_validator,
-    model_validator,
-)
+from pydantic import BeforeValidator, ConfigDict, Field, WrapValidator, field_validator, model_validator
 
 from hmmseg.errors import InputError
-from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable, read_toml, validated
+from hmmseg.io.schema import Finite, FinitePositive, Name, StrictTable
 from hmmseg.io.units import Quantity
 from simgap.simulators.user import LONGEST
 
@@ -43,7 +35,7 @@ KINDS = {
 def _placed(value: Any, check: Callable[[Any], Any]) -> Any:
     try:
         return check(value)
-    except ValidationError:
+    except ValueError:
         raise ValueError(f"{value!r:.40}; expected the name of a site, or [x, y, z] in m") from None
 
 
@@ -51,20 +43,16 @@ Place = Annotated[Name | tuple[Finite, Finite, Finite], WrapValidator(_placed)]
 
 
 class Mapped(Quantity):
-    """One column: the joint, actuator, sensor, body or site of the model that it records.
-
-    `kind` is the quantity, `axis` its component; SI = sign * unit * column + offset; `noise` is in the
-    column's unit.
-    """
+    """One column, and the part of the model that it records; SI = sign * unit * column + offset."""
 
     joint: Name | None = None
     actuator: Name | None = None
     sensor: Name | None = None
     body: Name | None = None
     site: Name | None = None
-    kind: str = ""
-    axis: str = ""
-    noise: FinitePositive | None = None
+    kind: str = ""  # the quantity
+    axis: str = ""  # its component
+    noise: FinitePositive | None = None  # in the column's unit
     sign: Finite = 1.0
     offset: Finite = 0.0
 
@@ -117,26 +105,21 @@ class Clock(Quantity):
 
 
 class Map(StrictTable):
-    """The map of a model.
-
-    `columns`: by name; `clock`: the column of times; `length`: of the windows that are compared [s];
-    `keyframe`: where what no column gives starts; `uncertain`: patterns of what was never measured; `sd`:
-    standard deviations of what was, by name; `payload_at`: by body the site where it carries a load, or the
-    place [m] in the body's frame.
-    """
+    """The map of a model."""
 
     model_config = ConfigDict(populate_by_name=False)
 
-    columns: dict[Name, Mapped] = Field(min_length=1)
+    columns: dict[Name, Mapped] = Field(min_length=1)  # by name
     clock: Annotated[
         Clock, BeforeValidator(lambda given: {"column": given} if isinstance(given, str) else given)
     ] = Field(default=Clock(), alias="time")
     length: Annotated[float, Field(gt=0, le=LONGEST, strict=True)] | None = Field(
         default=None, alias="window"
     )
-    keyframe: Name | None = None
-    uncertain: tuple[Name, ...] = ()
-    sd: dict[Name, FinitePositive] = Field(default_factory=dict)
+    keyframe: Name | None = None  # where what no column gives starts
+    uncertain: tuple[Name, ...] = ()  # patterns of what was never measured
+    sd: dict[Name, FinitePositive] = Field(default_factory=dict)  # of what was, by name
+    # by body the site where it carries a load, or the place [m] in its frame
     payload_at: dict[Name, Place] = Field(default_factory=dict)
 
     @field_validator("columns")
@@ -151,11 +134,6 @@ class Map(StrictTable):
                 found = f"{known[of]} and {column} are both the {m.kind} of {m.thing} {m.name}"
                 raise ValueError(f"{found}; expected one column of it (a second encoder is a sensor)")
         return columns
-
-
-def read_map(path: Path) -> Map:
-    """Read a map from a TOML file; InputError names the key at fault."""
-    return validated(Map, read_toml(path), str(path))
 
 
 SPEEDS = {"vel", "velocity", "dq", "qd", "speed", "qdot"}

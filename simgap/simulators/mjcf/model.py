@@ -29,24 +29,19 @@ GIVEN = 1000  # numerics: windows for which it is kept how far ties give in the 
 @dataclass
 class MjcfSimulator:
     """A compiled model with a sensor for each compared column. What no column determines starts as the
-    model's own run of the whole log has it.
-
-    `sensor`: address in the sensor data by compared column; `joints`: joint by position column; `driven`:
-    actuator by command column; `free`: columns of the pose by free joint; `poses`: columns of every body
-    whose whole pose is read; `played`: models with play in a joint, by setting; `spec`: what the model was
-    compiled from.
-    """
+    model's own run of the whole log has it."""
 
     model: Any
     map: Map
     channels: Mapping[str, Channel]
     parameters: Mapping[str, Parameter]
     settings: Mapping[str, Setting]
-    sensor: Mapping[str, int]
-    joints: Mapping[str, int]
-    driven: Mapping[str, int]
-    free: Mapping[int, Mapping[str, str]]
+    sensor: Mapping[str, int]  # address in the sensor data by compared column
+    joints: Mapping[str, int]  # joint by position column
+    driven: Mapping[str, int]  # actuator by command column
+    free: Mapping[int, Mapping[str, str]]  # columns of the pose by free joint
     touching: bool
+    # columns of every body whose whole pose is read
     poses: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     says: Mapping[str, str] = field(default_factory=dict)
     played: Mapping[str, Played] = field(default_factory=dict)  # by setting
@@ -132,10 +127,7 @@ class MjcfSimulator:
         return np.where(np.isfinite(found), found, first)
 
     def _state(self, job: Job, bare: np.ndarray | None = None, ran: np.ndarray | None = None) -> np.ndarray:
-        """Full physics state (size,) at a window's start.
-
-        `bare`: the state that columns do not determine; `ran`: the states of the log as the model runs it.
-        """
+        """Full physics state (size,) at a window's start; `bare`: what no column tells, `ran`: the log's."""
         there = None if ran is None else ran[job.recording.first]
         if job.start is None or bare is None:
             state = self._own_state(job.recording) if there is None or not self._partial else there.copy()
@@ -174,8 +166,7 @@ class MjcfSimulator:
         return self._closed(state) if self._inner.size else state
 
     def _closed(self, state: np.ndarray) -> np.ndarray:
-        """A full physics state whose inner joints close the model's loops: Newton's method for their places,
-        and the rates at which the loops stay closed."""
+        """A full physics state whose inner joints close the model's loops, by Newton's method."""
         m, data, dofs = self.model, self._data[0], self.model.jnt_dofadr[self._inner]
         place, rate = 1 + m.jnt_qposadr[self._inner], 1 + m.nq + dofs
         for _ in range(CLOSING):
@@ -233,8 +224,7 @@ class MjcfSimulator:
         return states < self.model.nv or self.model.na > 0
 
     def prepare(self, recordings: Sequence[Recording]) -> None:
-        """Keep logs to start windows from the model's run of them, where columns do not determine the whole
-        state."""
+        """Keep logs whose run by the model starts windows where columns do not suffice."""
         if self._partial or self._ties:
             self._logs, self._ran = {log.name: log for log in recordings}, {}
 
@@ -246,10 +236,7 @@ class MjcfSimulator:
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
     def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[Pairs]]:
-        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch at each.
-
-        A contact begins and ends between samples, so the samples on either side count too.
-        """
+        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch then or next to it."""
         t, none = recording.t[self._shown(recording)], frozenset[tuple[int, int]]()
         if not self.touching:
             return t, [none] * t.size
@@ -287,8 +274,7 @@ def tied(model: Any) -> np.ndarray:
 
 
 def inner(model: Any, known: Set[int]) -> np.ndarray:
-    """Hinges and slides (k,) that neither a column nor another joint tells, where bodies that are connected
-    close loops."""
+    """Hinges and slides (k,) that neither a column nor another joint tells, in loops of bodies."""
     kinds = mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD
     if not (np.isin(model.eq_type, kinds) & model.eq_active0.astype(bool)).any():
         return np.zeros(0, int)
@@ -304,12 +290,8 @@ def _carried(model: Any, data: Any, rates: np.ndarray) -> np.ndarray:
 
 
 def ties(model: Any, seen: Sequence[int]) -> list[tuple[int, int, Polynomial]]:
-    """Joints that no column shows but an equality has follow another, directly or not, that is `seen`.
-
-    Returns:
-        The joint, the other, and the polynomial of how far the other is from its reference that gives how far
-            the joint is from its own.
-    """
+    """Joints that no column shows but an equality has follow another, in the end one `seen`: the joint, the
+    other, and the polynomial from how far the other is from its reference to how far the joint is."""
     out, known = list[tuple[int, int, Polynomial]](), {*seen}
     pairs = [
         (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]), Polynomial(model.eq_data[k, :5]))
@@ -338,8 +320,7 @@ Pairs = frozenset[tuple[int, int]]
 
 
 def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
-    """The pairs that touch at times t (n,), with gaps up to BROKEN filled. A touch counts however brief, like
-    an impact."""
+    """The pairs that touch at times t (n,), with gaps up to BROKEN filled; a touch counts however brief."""
     out = list(sets)
     for pair in frozenset().union(*sets):
         rows = [i for i, s in enumerate(sets) if pair in s]

@@ -6,8 +6,6 @@ encoder is on the joint's side. A motor is not seen, so where it is in the gap w
 from a free run along the whole log.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -30,20 +28,16 @@ LIGHT = 1e-6  # numerics: kg, kg m^2: the motor's body; its rotor is its joint's
 
 @dataclass
 class Played:
-    """A model in which one joint has play.
-
-    `joint`: its number in the plain model; `logs`: by name; `width`: the setting of the play; `seen`: joint
-    by position column.
-    """
+    """A model in which one joint has play."""
 
     model: Any
     runs: Runs
     settings: Mapping[str, Setting]
     name: str
-    joint: int
-    logs: Mapping[str, Recording]
-    width: str
-    seen: Mapping[str, int]
+    joint: int  # its number in the plain model
+    logs: Mapping[str, Recording]  # by name
+    width: str  # the setting of the play
+    seen: Mapping[str, int]  # joint by position column
     known: dict = field(default_factory=dict, repr=False)
 
     def __call__(
@@ -64,8 +58,7 @@ class Played:
             return self.runs([j.recording for j in jobs], own, tuple(changed))
 
     def _ahead(self, log: Recording, width: float) -> np.ndarray:
-        """By how much the motor is ahead of its joint, and faster, at a log's samples (n, 2), in the model as
-        it came."""
+        """How far the motor is ahead of its joint, and faster, at a log's samples (n, 2)."""
         return latest(self.known, (log.name, width), lambda: self._run(log, width), KEPT)
 
     def _run(self, log: Recording, width: float) -> np.ndarray:
@@ -88,19 +81,8 @@ def played(
     spec: Any, name: str, actuator: str, make: Callable[[Any], Runs], wanted: Sequence[str],
     logs: Mapping[str, Recording], seen: Mapping[str, int],
 ) -> Played | None:  # fmt: skip
-    """Build the model with play in a joint.
-
-    Args:
-        spec: The MjSpec, which is changed.
-        name, actuator: The joint, and the actuator that moves it.
-        make: Makes the runs of a model.
-        wanted: Settings that the model is to have.
-        logs: By name.
-        seen: Joint by position column.
-
-    Returns:
-        The model; None where the joint has no rotor that could move alone, or MuJoCo refuses it.
-    """
+    """Build, by changing `spec`, the model with play in the joint `name` that `actuator` moves; None where it
+    has no rotor that could move alone, or MuJoCo refuses it."""
     joint, body = spec.joint(name), spec.joint(name).parent
     if not joint.armature > 0:
         return None

@@ -1,7 +1,5 @@
 """Many windows run by MuJoCo at once, from commands to channels."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -20,8 +18,7 @@ from simgap.simulators.recording import Recording
 
 
 class Held:
-    """Commands held from sample to sample, averaged over each step of the simulator; of one window (n,), or
-    of many with equally many samples (B, n)."""
+    """Commands held from sample to sample, averaged over the simulator's steps; of windows (n,) or (B, n)."""
 
     def __init__(self, since: np.ndarray, times: np.ndarray) -> None:
         self.since, self.times = since, times
@@ -30,10 +27,8 @@ class Held:
         self.at = self._at(since)
 
     def __call__(self, values: np.ndarray, line: float = 0.0) -> np.ndarray:
-        """Means (..., steps) of a column (..., n); missing samples repeat the one before.
-
-        `line`: from 0, held in steps, to 1, on lines to the next sample.
-        """
+        """Means (..., steps) of a column (..., n); missing samples repeat the one before. `line`: from 0,
+        held in steps, to 1, on lines to the next sample."""
         seen = np.isfinite(values)
         if seen.all():
             t, u, k = self.since, values, self.at
@@ -62,8 +57,7 @@ class Held:
 
 
 class Between:
-    """Interpolation on an even grid of `times` (T,) at `at` (B, n) in B windows, by cubics through neighbours
-    (Catmull & Rom 1974)."""
+    """Cubics through neighbours (Catmull & Rom 1974) on even `times` (T,), at `at` (B, n) in B windows."""
 
     def __init__(self, at: np.ndarray, times: np.ndarray) -> None:
         place = np.clip(at / (times[1] - times[0]), 0, times.size - 1)
@@ -122,12 +116,8 @@ FAR = 1e9  # numerics: a run that reads beyond it has diverged
 
 @dataclass
 class Runs:
-    """Runs of the `model` in threads, one for each of `data`; the other fields as in `MjcfSimulator`.
-
-    The same windows are run hundreds of times, so how they lie on the steps is kept. So are the latest runs,
-    because many are needed again: a finite difference in one number of the solver includes the runs of all
-    others.
-    """
+    """Runs of the `model` in threads, one for each of `data`; other fields as in `MjcfSimulator`. The latest
+    are kept, since a finite difference in one number of the solver includes those of all others."""
 
     model: Any
     data: Sequence[Any]
@@ -141,8 +131,7 @@ class Runs:
     def __call__(
         self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[tuple[str, float], ...]
     ) -> list[Channels | None]:
-        """Channels along logs from states (B, size), None of one that diverged. `changed`: settings in which
-        the model now differs from how it came."""
+        """Channels along logs from states (B, size) with some settings changed, None of one that diverged."""
         longest = max(float(log.t[-1] - log.t[0]) for log in logs)
         numbers = first.shape[1] + self.model.nsensordata + self.model.nv
         size = max(1, int(BATCH / ((longest / self.model.opt.timestep + 2) * numbers)))
@@ -194,8 +183,7 @@ class Runs:
         return latest(self._ran, key, run, int(KEPT / size))
 
     def _side(self, logs: Sequence[Recording], times: np.ndarray) -> tuple[Held, Between]:
-        """How windows with equally many samples lie on the steps: to hold their commands and read their
-        sensors."""
+        """How windows with equally many samples lie on the steps: for their commands and their sensors."""
         since = np.array([log.t - log.t[0] for log in logs])
         key = (since.shape, since.tobytes(), times.size, float(times[1]))
         return latest(self._sides, key, lambda: (Held(since, times), Between(since, times)))
@@ -203,8 +191,7 @@ class Runs:
     def _read(
         self, logs: Sequence[Recording], sensed: np.ndarray, side: tuple[Held, Between], times: np.ndarray
     ) -> list[Channels | None]:
-        """Sensors (B, steps, sensors) at the logs' times: positions and velocities by cubics, others by
-        lines."""
+        """Sensors (B, steps, sensors) at the logs' times, positions and velocities by cubics."""
         smooth = [n for n in self.sensor if self.channels[n].kind in ("position", "velocity")]
         held, between = side
         read = between(sensed[:, :, [self.sensor[n] for n in smooth]])

@@ -4,8 +4,6 @@ A setting is a field of the compiled model, set in place and restored, or a para
 law (`laws.py`), or how commands are held between samples (`runs.py`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,19 +27,15 @@ HELD = ("hold", "smooth", "late")
 
 @dataclass(frozen=True)
 class Setting:
-    """One quantity that can be set: its `nominal` value, and `put(model, value)`, which sets it.
-
-    `derived`: whether constants derived from it (mj_setConst) must be recomputed; `stored`: whether MuJoCo
-    writes it to XML; `mixed`: of what comes in whole steps only, the value whose run is interpolated with the
-    nominal one.
-    """
+    """One quantity that can be set."""
 
     name: str
     unit: str
     nominal: float
-    put: Put
-    derived: bool = False
-    stored: bool = True
+    put: Put  # sets a value in a model
+    derived: bool = False  # whether constants derived from it (mj_setConst) must be recomputed
+    stored: bool = True  # whether MuJoCo writes it to XML
+    # of what comes in whole steps, the value whose run is interpolated with the nominal one
     mixed: float | None = None
 
 
@@ -65,8 +59,7 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 
 def payload_place(model: Any, name: str) -> np.ndarray:
-    """Where a body carries a load (3,) [m], in its frame: its farthest site, else the farthest centre of its
-    geoms, else its centre of mass."""
+    """Where a body carries a load (3,) [m]: its farthest site, else geom, else its centre of mass."""
     b = object_id(model, "body", name)
     for places, owner in ((model.site_pos, model.site_bodyid), (model.geom_pos, model.geom_bodyid)):
         mine = np.array(places[np.asarray(owner) == b])
@@ -312,33 +305,21 @@ KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...
 
 
 def setting_of(model: Any, name: str) -> Setting:
-    """The setting of a model by its name.
-
-    Args:
-        model: A compiled MuJoCo model.
-        name: `KIND:NAME.ATTRIBUTE`; `option.ATTRIBUTE` and `drive.ATTRIBUTE` of the whole model.
-
-    Returns:
-        The setting, whose nominal value is the model's.
-
-    Raises:
-        InputError: The name is unknown; the nearest known one is named.
-    """
+    """The setting `KIND:NAME.ATTRIBUTE`, or of the whole model `option.ATTRIBUTE` or `drive.ATTRIBUTE`, with
+    the model's value as its nominal one; InputError names the nearest known."""
     where = f"--candidate {name}"
     head, dot, attribute = name.rpartition(".")
     kind, colon, thing = head.partition(":")
     if not dot or kind not in KINDS or bool(colon) == (kind in ("option", "drive")):
-        raise InputError(
-            where, "names nothing of the model", "KIND:NAME.ATTRIBUTE, such as joint:elbow.damping"
-        )
+        expected = "KIND:NAME.ATTRIBUTE, such as joint:elbow.damping"
+        raise InputError(where, "names nothing of the model", expected)
     if colon and thing not in (known := names_of(model, kind)):
         raise InputError(where, f"the model has no {kind} {thing}", nearest(thing, known))
     make, attributes = KINDS[kind]
     found = make(model, thing, attribute)
     if found is None:
-        raise InputError(
-            where, f"{kind} has no {attribute} that can be a candidate", nearest(attribute, attributes)
-        )
+        problem = f"{kind} has no {attribute} that can be a candidate"
+        raise InputError(where, problem, nearest(attribute, attributes))
     return found
 
 

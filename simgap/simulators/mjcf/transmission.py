@@ -28,11 +28,8 @@ def elasticity(
     motions: Sequence[Motion],
     joints: Sequence[int],
 ) -> list[RobotEffect]:
-    """Candidates of gears that give behind an encoder at the motor.
-
-    A joint lags by compliance times the torque transmitted, which moves bodies and sites beyond it as they
-    are read. Valid for motion slow against the gear's own ringing.
-    """
+    """Candidates of gears that give behind an encoder at the motor: a joint lags by compliance times the
+    torque transmitted, slowly against the gear's own ringing, which moves bodies and sites beyond it."""
     model, data = simulator.model, mujoco.MjData(simulator.model)
     columns = simulator.map.columns
     seen = {n: m for n, m in columns.items() if m.thing in ("site", "body") and m.axis in ("x", "y", "z")}
@@ -105,8 +102,7 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
 
     What motors give less what the motion takes, regressed on waves of the joint's angle next to what changes
     slowly with it (the periodogram of Lomb 1976 and Scargle 1982). 0 where the joint does not turn enough, or
-    chance alone would show as much: SPAN makes as many samples one.
-    """
+    chance alone would show as much: SPAN makes as many samples one."""
     q, rate, torque, motor = (
         np.concatenate([getattr(m, name)[joint][m.rows] for m in motions])
         for name in ("position", "rate", "torque", "motor")
@@ -134,18 +130,15 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
 
 @dataclass(frozen=True)
 class Motion:
-    """Times (n,) [s] of a log's samples, and the rows of which torques are computed, 100 a second at most.
+    """The motion along a log, by joint."""
 
-    By joint: position, rate, acceleration, the torque that they take, and what motors give.
-    """
-
-    t: np.ndarray
-    rows: np.ndarray
+    t: np.ndarray  # (n,) [s] of its samples
+    rows: np.ndarray  # of which torques are computed, 100 a second at most
     position: dict[int, np.ndarray]
     rate: dict[int, np.ndarray]
     acceleration: dict[int, np.ndarray]
-    torque: dict[int, np.ndarray]
-    motor: dict[int, np.ndarray]
+    torque: dict[int, np.ndarray]  # that it takes
+    motor: dict[int, np.ndarray]  # that motors give
 
 
 def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
