@@ -8,6 +8,7 @@ differ by more than sensors and hand explain.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class PredictiveCheck:
     repeats: dict[str, int]  # observations that determine it, 0 if only the prior does
     warnings: tuple[str, ...]
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """p-values, excess scatter and number of repeats, by channel."""
         return {
             name: {"p_value": p, "scatter_between_grips": self.excess[name], "repeats": self.repeats[name]}

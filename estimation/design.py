@@ -510,7 +510,11 @@ def build(aligned: AlignedTrials, weighed: Sequence[WeighedTrial], noise: Noise)
 
 
 def _combined(
-    raw: np.ndarray, variance: np.ndarray, valid: np.ndarray, coefficients: np.ndarray, where: tuple
+    raw: np.ndarray,
+    variance: np.ndarray,
+    valid: np.ndarray,
+    coefficients: np.ndarray,
+    where: tuple[np.ndarray, ...],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means, variances (K,) and coefficients (K, Q) of the observations. Drawn alignments are imputations:
     their variance is that within one plus 1 + 1 / S times that between them (Rubin 1987, equation 3.1.5),

@@ -8,6 +8,7 @@ its friction against the support (`ground_friction`).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
@@ -246,9 +247,9 @@ class FrictionPosterior:
     reason: str | None = None  # why there is no value, or no bound
     ground: GroundFriction | None = None  # of the block on its support, if it was slid
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """The entry `friction` of one block in the JSON of `identify`."""
-        out: dict = {"unit": "1", "lower_bound": self.lower_bound}
+        out: dict[str, Any] = {"unit": "1", "lower_bound": self.lower_bound}
         if self.mu_draws is not None:
             out |= summary(self.mu_draws, "1")
         if self.slip is not None:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -79,11 +80,11 @@ class Identification(Tabled):
             raise KeyError(f"{obj}.{prop} is undetermined: {self.reasons.get(f'{obj}.{prop}', '')}")
         return self.draws[:, self.names.index((obj, prop))]
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """The body of `identify`'s JSON document."""
         draws, described = self.sampled, decompose(self.task)
 
-        def entry(obj: str, prop: str) -> dict | None:
+        def entry(obj: str, prop: str) -> dict[str, Any] | None:
             if (obj, prop) not in self.names:
                 return None
             subtasks = source_subtasks(described, obj, prop)

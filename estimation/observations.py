@@ -57,7 +57,10 @@ def channel_sds(signals: Sequence[Signals], aligned: AlignedTrials) -> dict[str,
     return out
 
 
-def estimated_noise(pooled: dict[str, list], scales: dict[str, float], stated: dict[str, float]) -> Noise:
+Pooled = dict[str, list[tuple[np.ndarray, np.ndarray]]]  # residuals and weights by channel
+
+
+def estimated_noise(pooled: Pooled, scales: dict[str, float], stated: dict[str, float]) -> Noise:
     """Noise of each channel from residuals and weights, pooled over grips; `stated`: sds where known."""
     variance, count = {}, {}
     for key, pairs in pooled.items():
@@ -224,7 +227,7 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
     for key in KEYS:
         groups = [of[key] for of in members.values()]
         scales[key] = _scale([(readings[key], best) for _, readings, best, _ in prepared], groups)
-    pooled: dict[str, list] = {key: [] for key in (*KEYS, *FORCE_CHANNELS)}
+    pooled: Pooled = {key: [] for key in (*KEYS, *FORCE_CHANNELS)}
     landings = [(a, b) for a, b in pairwise(steps) if (a.state, b.state) == (ABOVE_GROUND, ON_GROUND)]
     touched = {b.move: a.index for a, b in landings}
     weighed = []

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -118,7 +119,9 @@ ORDER = ("weight", "width", "height", "friction")
 
 
 def draw_estimates(
-    properties: Mapping[str, Mapping[str, dict | None]], actual: Actual | None, path: Path | None = None
+    properties: Mapping[str, Mapping[str, dict[str, Any] | None]],
+    actual: Actual | None,
+    path: Path | None = None,
 ) -> Axes:
     """Plot one row per property: 68 and 95 % interval in % of the measured value, with the numbers.
     `properties` is the JSON of `identify`. Without a measured value the row is relative to the estimate
@@ -154,7 +157,7 @@ def draw_estimates(
 
 
 def _draw_row(
-    ax: Axes, y: int, key: str, estimate: dict | None, measured: tuple[float, float] | None
+    ax: Axes, y: int, key: str, estimate: dict[str, Any] | None, measured: tuple[float, float] | None
 ) -> float:
     """Draw one property; returns the largest distance from 0 that it needs [%]."""
     factor, unit = SHOWN[key]

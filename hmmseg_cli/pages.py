@@ -229,7 +229,7 @@ def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:
     return rows
 
 
-def _properties(effect: Mapping[str, Any], measured: Mapping | None) -> list[tuple[str, ...]]:
+def _properties(effect: Mapping[str, Any], measured: Mapping[str, Any] | None) -> list[tuple[str, ...]]:
     rows = []
     for name, shift in (effect.get("property_shift") or {}).items():
         block, _, prop = name.rpartition(".")

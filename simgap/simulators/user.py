@@ -243,8 +243,8 @@ def _checked(found: Any, where: str, file: str) -> UserSimulator:
             raise InputError(where, f"has no mapping {name!r}", "parameters, channels and simulate")
     if not callable(run):
         raise InputError(where, "cannot be run", "a method simulate(parameters, recording, start=None)")
-    parameters = {n: _made(Parameter, v, f"{where}: parameter {n}") for n, v in found.parameters.items()}
-    channels = {n: _made(Channel, v, f"{where}: channel {n}") for n, v in found.channels.items()}
+    parameters = {n: _made(Parameter, v, f"{where}: parameter {n}") for n, v in own("parameters").items()}
+    channels = {n: _made(Channel, v, f"{where}: channel {n}") for n, v in own("channels").items()}
     by_log = {n: _made(Parameter, v, f"{where}: by_log {n}") for n, v in (own("by_log") or {}).items()}
     compared = tuple(n for n, c in channels.items() if c.kind != "command")
     if not compared:

@@ -7,7 +7,9 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.animation import FFMpegWriter, PillowWriter
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from hmmseg.errors import InputError
@@ -79,7 +81,7 @@ def require_encoder(suffix: str) -> None:
         raise InputError("--animation mp4", "the program ffmpeg is not installed", "gif, or ffmpeg")
 
 
-def _draw_scene(stage, scene: Scene):
+def _draw_scene(stage: Axes, scene: Scene):
     """Draw ground, blocks, pads and links; the artists that move."""
     seen = np.concatenate([scene.motion.position.reshape(-1, 2), scene.motion.blocks.reshape(-1, 2)])
     left, right = scene.motion.position[..., 0].min(), scene.motion.position[..., 0].max()
@@ -115,7 +117,7 @@ def _joints(scene: Scene) -> list[np.ndarray]:
     return chains
 
 
-def _draw_traces(panels, scene: Scene, traces: Sequence[Trace]) -> list:
+def _draw_traces(panels: Sequence[Axes], scene: Scene, traces: Sequence[Trace]) -> list[Line2D]:
     """Draw all traces; the lines that mark the current time."""
     cursors = []
     for panel, trace in zip(panels, traces, strict=True):

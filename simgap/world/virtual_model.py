@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -191,7 +192,7 @@ class VirtualModel:
 
 
 @lru_cache
-def _program(num_blocks: int, substeps: int) -> Callable:
+def _program(num_blocks: int, substeps: int) -> Callable[..., Any]:
     """A compiled step on flat arrays, for any scene; few arguments make the call fast."""
     block = [Block(1.0, 1.0, 1.0)] * num_blocks
     template = physics(Rig(), block)

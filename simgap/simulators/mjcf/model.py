@@ -50,9 +50,9 @@ class MjcfSimulator:
     acts: str = ACTS
     threads: int = field(default_factory=lambda: max(1, min(4, os.cpu_count() or 1)))
     _logs: dict[str, Recording] = field(default_factory=dict, repr=False)
-    _ran: dict = field(default_factory=dict, repr=False)
-    _gave: dict = field(default_factory=dict, repr=False)
-    _touched: dict = field(default_factory=dict, repr=False)
+    _ran: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _gave: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _touched: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         self._data = [mujoco.MjData(self.model) for _ in range(self.threads)]
@@ -75,7 +75,7 @@ class MjcfSimulator:
     def simulate_many(self, jobs: Sequence[Job]) -> list[Channels | None]:
         """All jobs' channels, None of one that diverged; jobs with equal parameters run together."""
         out: list[Channels | None] = [None] * len(jobs)
-        groups: dict[tuple, list[int]] = defaultdict(list)
+        groups: dict[tuple[Any, ...], list[int]] = defaultdict(list)
         for i, job in enumerate(jobs):
             values, own = job.parameters.items(), self._nominal
             acting = {self.parameters[n].effect for n, v in values if v != own[n]}
@@ -319,7 +319,7 @@ BROKEN = 0.04
 Pairs = frozenset[tuple[int, int]]
 
 
-def closed(t: np.ndarray, sets: Sequence[frozenset]) -> list[frozenset]:
+def closed(t: np.ndarray, sets: Sequence[Pairs]) -> list[Pairs]:
     """The pairs that touch at times t (n,), with gaps up to BROKEN filled; a touch counts however brief."""
     out = list(sets)
     for pair in frozenset().union(*sets):

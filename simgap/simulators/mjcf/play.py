@@ -38,7 +38,7 @@ class Played:
     logs: Mapping[str, Recording]  # by name
     width: str  # the setting of the play
     seen: Mapping[str, int]  # joint by position column
-    known: dict = field(default_factory=dict, repr=False)
+    known: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __call__(
         self, jobs: Sequence[Job], first: np.ndarray, changed: Sequence[tuple[str, float]], nominal: Any

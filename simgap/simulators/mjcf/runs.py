@@ -125,8 +125,8 @@ class Runs:
     sensor: Mapping[str, int]
     driven: Mapping[str, int]
     free: Mapping[int, Mapping[str, str]]
-    _sides: dict = field(default_factory=dict, repr=False)
-    _ran: dict = field(default_factory=dict, repr=False)
+    _sides: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _ran: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __call__(
         self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[tuple[str, float], ...]
@@ -140,7 +140,9 @@ class Runs:
             out += self._roll(logs[a : a + size], first[a : a + size], changed)
         return out
 
-    def _roll(self, logs: Sequence[Recording], first: np.ndarray, changed: tuple) -> list[Channels | None]:
+    def _roll(
+        self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[Any, ...]
+    ) -> list[Channels | None]:
         h = float(self.model.opt.timestep)
         span = max(float(log.t[-1] - log.t[0]) for log in logs)
         times = np.arange(int(np.ceil(span / h - 1e-9)) + 2) * h
@@ -165,7 +167,7 @@ class Runs:
                 out[i] = channels
         return out
 
-    def _sensed(self, first: np.ndarray, control: np.ndarray, changed: tuple) -> np.ndarray:
+    def _sensed(self, first: np.ndarray, control: np.ndarray, changed: tuple[Any, ...]) -> np.ndarray:
         """Sensors (B, steps, sensors) of runs from these states."""
         laws = Laws.of(self.model, changed)
 
