@@ -163,6 +163,7 @@ class Runs:
         sides = [self._side(own, times) for _, own in parts]
         control = np.zeros((len(logs), times.size, self.model.nu))
         line, late, smooth = (dict(changed).get(name, 0.0) for name in (HOLD, LATE, SMOOTH))
+        smooth = max(smooth, line * smooth)  # steps have no curve
         for (mine, own), (plain, _) in zip(parts, sides, strict=True):
             # A loop that sets a command and makes a step has the line where the step begins, not its mean.
             held = _carried_out(own, plain, (late + 0.5 * line) * h)
