@@ -18,6 +18,8 @@ from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import MIN_SAMPLES, trial_of
 from hmmseg.io.units import Column
 
+OTHER = "not the time"  # look: our name of a column t where another counts the time
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -54,18 +56,24 @@ def read_recording(
     `acts`: name of a column to add of the times [s] from which commands acted, where these differ. InputError
     for a column that is missing or no number, or a clock that goes back or has another unit."""
     names = tuple(dict.fromkeys(wanted))
-    clock = {"t": Column.model_validate({"from": times, "unit": unit})}
-    rig = Rig.model_construct(columns=clock, topics=clock if times != "t" else {})
+    ours = {n: OTHER if n == "t" != times else n for n in names}
+    given = {"t": Column.model_validate({"from": times, "unit": unit})}
+    given |= {OTHER: Column.model_validate({"from": "t"})} if OTHER in ours.values() else {}
+    rig = Rig.model_construct(columns=given, topics=given if times != "t" else {})
     table = read_table(path, [times, *names])
     if times not in table.names:
         expected = f'times in s, or time = "..." in map.toml, {nearest(times, table.names)}'
         raise InputError(f"{path}: column {times}", "missing", expected)
-    trial = trial_of(table, rig, SequenceTask(("all",), channels=names))
+    for name in names:
+        if name not in table.names:
+            raise InputError(f"{path}: column {name}", "missing", nearest(name, table.names))
+    trial = trial_of(table, rig, SequenceTask(("all",), channels=tuple(ours.values())))
     for finding in check_clock(trial, None):
         if finding.certain:
             remedy = f'{{column = "{times}", unit = {json.dumps(finding.changes["t"]["unit"])}}}'
             raise InputError(f"{path}: column {times}", finding.problem, f"time = {remedy} in map.toml")
-    found = Recording(path.name, trial.t, trial.channels, warnings=trial.warnings)
+    columns = {n: trial.channels[own] for n, own in ours.items() if own in trial.channels}
+    found = Recording(path.name, trial.t, columns, warnings=trial.warnings)
     return _on_one_clock(found, commands, acts)
 
 

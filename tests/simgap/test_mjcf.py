@@ -391,6 +391,24 @@ def test_smoothed_commands_are_means_with_their_neighbours(files):
     assert np.abs(run() - plain()).max() > 1e-3
 
 
+def test_commands_that_follow_a_curve_between_samples_are_in_reach(files):
+    """A loop at 1 kHz whose commands are logged at 100 Hz: lines lie off its curve, always to one side."""
+    wanted = lambda t: 0.3 * np.sin(20 * t)  # noqa: E731
+    found, run = turning(files, u=wanted(np.arange(0, 2, 0.01)))
+    model = found.simulator.model
+    data, h = mujoco.MjData(model), float(model.opt.timestep)
+    data.qvel[:], told = 1.8, []
+    for k in range(round(1.99 / h) + 1):
+        told.append(float(data.qpos[0]))
+        data.ctrl[:] = wanted(k * h)
+        mujoco.mj_step(model, data)
+    told = np.interp(np.arange(0, 2, 0.01), h * np.arange(len(told)), told)
+    low = found.simulator.parameters["option.smooth"].low
+    lines, curve = (np.abs(run(option__hold=1.0, option__smooth=s) - told)[1:-2].max() for s in (0.0, low))
+    assert curve < 0.1 * lines
+    np.testing.assert_array_equal(run(option__smooth=low), run())  # steps have none
+
+
 FINGERS = """<mujoco>
   <worldbody>
     <body><joint name="left" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/></body>
@@ -517,15 +535,6 @@ def test_a_map_of_a_urdf_has_torques_drive_it_and_leaves_goals_to_its_user(urdf)
     assert left == ["pivot_cmd"]
 
 
-FOUR_BARS = """<mujoco><worldbody>
-  <body><joint name="crank" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .1 0 0" size=".01" contype="0"/>
-    <body pos=".1 0 0" name="bar"><joint name="knee" axis="0 1 0"/>
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".01" contype="0"/></body></body>
-  <body pos=".35 0 -.05" name="rocker"><joint name="rock" axis="0 1 0"/>
-    <geom type="capsule" fromto="0 0 0 .05 0 .05" size=".01" contype="0"/></body>
-  </worldbody><equality><connect body1="bar" body2="rocker" anchor=".3 0 0"/></equality></mujoco>"""
-
-
 @pytest.mark.parametrize(("name", "value", "stated"), [
     (None, None, ()), ("joint:left.armature", 0.5, ('armature="0.3"', 'armature="0.5"')),
     ("body:left.mass", 0.2, ('mass="0.1"', 'mass="0.2"')),
@@ -558,32 +567,6 @@ def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, 
         data.ctrl[0] = u
         mujoco.mj_step(model, data)
     assert np.abs(np.column_stack([read["l"], read["r"]]) - own).max() < 1e-9
-
-
-def test_windows_begin_with_closed_loops(files):
-    """What no column shows follows from what they show, and moves as the loop does."""
-    columns = '[columns.c]\njoint = "crank"\n[columns.r]\njoint = "rock"\n'
-    simulator = load_mjcf(*files(FOUR_BARS, columns)).simulator
-    model, data = simulator.model, mujoco.MjData(simulator.model)
-    data.qpos[0], data.qvel[0] = 0.2, 1.0
-    for _ in range(20):  # the rocker that goes with this crank, by the loop itself
-        mujoco.mj_fwdPosition(model, data)
-        jacobian = np.array([column(model, data, one) for one in np.eye(3)[1:]]).T
-        data.qpos[1:] -= np.linalg.lstsq(jacobian, data.efc_pos, rcond=None)[0]
-    drawn = column(model, data, np.array([1.0, 0.0, 0.0]))
-    data.qvel[1:] = -np.linalg.lstsq(jacobian, drawn, rcond=None)[0]
-    log = Recording("a", np.arange(3) / 100, {"c": np.full(3, data.qpos[0]), "r": np.full(3, data.qpos[2])})
-    start = {"c": data.qpos[0], "c_rate": 1.0, "r": data.qpos[2], "r_rate": data.qvel[2]}
-    state = simulator._state(Job({}, log, start))
-    np.testing.assert_allclose(state[1:4], data.qpos, atol=1e-7)
-    np.testing.assert_allclose(state[4:7], data.qvel, atol=1e-7)
-
-
-def column(model, data, rates: np.ndarray) -> np.ndarray:
-    """Rates of the constraints at rates of the joints."""
-    out = np.zeros(data.nefc)
-    mujoco.mj_mulJacVec(model, data, out, rates)
-    return out
 
 
 def test_joints_that_nothing_shows_are_said(files):

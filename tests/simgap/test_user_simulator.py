@@ -186,3 +186,14 @@ def test_logs_with_their_own_name_for_time(tmp_path):
     path.write_text("t,y\n" + "".join(f"{0.1 * (i if i != 5 else 3)},{i}\n" for i in range(10)))
     with pytest.raises(InputError, match=r"row 7, column t: 0\.3 after 0\.4; expected strictly increasing"):
         read_recording(path, ["y"])
+
+
+def test_a_column_t_next_to_another_that_counts_the_time_is_itself(tmp_path):
+    path, t = tmp_path / "log.csv", 0.01 * np.arange(20)
+    rows = np.column_stack([t, np.sin(9 * t), np.cos(9 * t)])
+    np.savetxt(path, rows, "%.6f", ",", header="stamp,t,y", comments="")
+    log = read_recording(path, ["t", "y"], "stamp")
+    np.testing.assert_allclose([log.t, log["t"], log["y"]], rows.T, atol=1e-5)
+    path.write_text(path.read_text().replace("stamp,t,y", "stamp,torque,y"))
+    with pytest.raises(InputError, match=r"column t: missing; expected .*torque"):
+        read_recording(path, ["t", "y"], "stamp")

@@ -240,8 +240,9 @@ class _Catalogue:
             says = "commands between samples: in steps (0), in lines (1, half a sample sooner)"
             self.add(HOLD, 0.5, says, low=0.0, high=1.0)
             # Without it lines would do for whatever smooths commands, and be half a sample sooner for it.
+            # Below zero are curves, which lie off their chords by a twelfth of the second difference.
             says = "commands smoothed by what carries them out: this share is from the neighbours' mean"
-            self.add(SMOOTH, 0.25, says, low=0.0, high=0.5)
+            self.add(SMOOTH, 0.25, says, low=-1 / 6, high=0.5)
             says = "commands come later within the simulator's step, by this share of it"
             self.add(LATE, 0.25, says, low=-0.5, high=0.5)
         if self.simulator.touching:

@@ -23,7 +23,7 @@ from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, 
 from simgap.simulators.recording import Recording
 
 CLOSING, CLOSED = 20, 1e-9  # numerics: most steps that close a loop, and the last of them
-GIVEN = 1000  # numerics: windows for which it is kept how far ties give in the model's own run
+GIVEN = 1000  # numerics: windows for which it is kept how ties have them start, and how far they give
 
 
 @dataclass
@@ -124,7 +124,7 @@ class MjcfSimulator:
             found = free_run(self.model, self._data[0], recording, first, self.driven)
         found[0] = first
         found[:, 0] = 0.0
-        return np.where(np.isfinite(found), found, first)
+        return self._followed(recording, np.where(np.isfinite(found), found, first))
 
     def _state(self, job: Job, bare: np.ndarray | None = None, ran: np.ndarray | None = None) -> np.ndarray:
         """Full physics state (size,) at a window's start; `bare`: what no column tells, `ran`: the log's."""
@@ -139,7 +139,7 @@ class MjcfSimulator:
         for column, (q, v) in self._places.items():
             state[1 + q] = job.start[column]
             state[1 + nq + v] = job.start[column + RATE]
-        state = self._tied(state)
+        state = latest(self._gave, (state.tobytes(),), lambda: self._tied(state), GIVEN).copy()
         if there is not None:  # under load a tie gives, as in the model's own run
             state += latest(self._gave, there.tobytes(), lambda: there - self._tied(there), GIVEN)
         for joint, columns in self.free.items():
@@ -170,10 +170,7 @@ class MjcfSimulator:
         m, data, dofs = self.model, self._data[0], self.model.jnt_dofadr[self._inner]
         place, rate = 1 + m.jnt_qposadr[self._inner], 1 + m.nq + dofs
         for _ in range(CLOSING):
-            mujoco.mj_setState(m, data, state, FULL)
-            mujoco.mj_fwdPosition(m, data)
-            loops = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
-            slopes = np.stack([_carried(m, data, one)[loops] for one in np.eye(m.nv)[dofs]], 1)
+            loops, slopes = self._loops(state)
             step = np.linalg.lstsq(slopes, data.efc_pos[loops], rcond=None)[0]
             state[place] -= step
             if np.abs(step).max() < CLOSED:
@@ -182,6 +179,29 @@ class MjcfSimulator:
         drawn = _carried(m, data, state[1 + m.nq : 1 + m.nq + m.nv])[loops]
         state[rate] = -np.linalg.lstsq(slopes, drawn, rcond=None)[0]
         return state
+
+    def _loops(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The constraints (k,) that close loops in a state, and their slopes (k, n) by the inner joints."""
+        m, data = self.model, self._data[0]
+        mujoco.mj_setState(m, data, state, FULL)
+        mujoco.mj_fwdPosition(m, data)
+        loops = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+        turns = np.eye(m.nv)[m.jnt_dofadr[self._inner]]
+        return loops, np.stack([_carried(m, data, one)[loops] for one in turns], 1)
+
+    def _followed(self, log: Recording, ran: np.ndarray) -> np.ndarray:
+        """Full physics states (num_timesteps, size) along a log, `ran` freely, where columns determine the
+        inner joints: these close the loops from one sample to the next, which a run that strays does in
+        another way."""
+        if not self._inner.size or np.linalg.matrix_rank(self._loops(ran[0])[1]) < self._inner.size:
+            return ran
+        place = 1 + self.model.jnt_qposadr[self._inner]
+        for column, (q, _) in self._places.items():
+            ran[:, 1 + q] = bridged(log[column])
+        for k in range(len(ran)):
+            ran[k, place] = ran[max(k - 1, 0), place]
+            ran[k] = self._tied(ran[k])
+        return ran
 
     def _own_state(self, log: Recording) -> np.ndarray:
         """The model's own start of a log."""

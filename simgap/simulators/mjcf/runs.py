@@ -69,7 +69,8 @@ class Between:
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Values (B, n, k) from those on the grid (B, T, k)."""
-        flat, s = values.reshape(-1, values.shape[-1]), self.s
+        windows, steps, count = values.shape
+        flat, s = values.reshape(windows * steps, count), self.s
         p0, p1, p2, p3 = (flat[rows] for rows in self.rows)
         bend = s * (p2 - p0) + s**2 * (2 * p0 - 5 * p1 + 4 * p2 - p3) + s**3 * (3 * (p1 - p2) + p3 - p0)
         return np.where(self.inner, p1 + 0.5 * bend, p1 + s * (p2 - p1))
@@ -153,6 +154,7 @@ class Runs:
         sides = [self._side(own, times) for _, own in parts]
         control = np.zeros((len(logs), times.size, self.model.nu))
         line, late, smooth = (dict(changed).get(name, 0.0) for name in (HOLD, LATE, SMOOTH))
+        smooth = max(smooth, line * smooth)  # steps have no curve
         for (mine, own), (plain, _) in zip(parts, sides, strict=True):
             # A loop that sets a command and makes a step has the line where the step begins, not its mean.
             held = _carried_out(own, plain, (late + 0.5 * line) * h)
