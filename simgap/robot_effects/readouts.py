@@ -173,7 +173,9 @@ def by_log(setting: Setting) -> Iterator[RobotEffect]:
         yield of_log("log.shift", says, dict.fromkeys(logs, known["shift"]), late)
     for body, columns in setting.poses().items() if "offset" in known else ():
 
-        def moved(window: Recording, channels: Channels, theta: Theta, columns=columns) -> Channels:
+        def moved(
+            window: Recording, channels: Channels, theta: Theta, columns: Mapping[str, str] = columns
+        ) -> Channels:
             arm = np.array([theta[f"{window.name}.{a}"] for a in PLACE])
             return _shifted(channels, [columns[a] for a in PLACE], [columns[a] for a in TURN], arm)
 

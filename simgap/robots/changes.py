@@ -175,7 +175,8 @@ class Comparison:
             theta = of.columns(z)
             theta[:, p:] = 0.0
 
-            def local(z: np.ndarray, theta=theta) -> Local:  # theta moves little, and its columns less
+            # Theta moves little, and its columns less.
+            def local(z: np.ndarray, theta: np.ndarray = theta) -> Local:
                 information, pull = runs.information(runs.rows(of.point(z)), theta + of.columns(z, effects))
                 return information.sum(0) + bend, pull.sum(0) - bend @ z
 

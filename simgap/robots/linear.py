@@ -65,7 +65,7 @@ class Base:
     read-out effects, and rows (N,)."""
 
     point: Point
-    begun: list
+    begun: list[Mapping[str, float] | None]
     true: list[Channels | None]
     read: list[Channels | None]
     rows: np.ndarray

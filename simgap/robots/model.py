@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class Composed:
     wobble: np.ndarray | None = None
     motion: tuple[int, ...] = ()
     about: Point = field(default_factory=dict)
-    _slopes: dict = field(default_factory=dict, repr=False)
+    _slopes: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(

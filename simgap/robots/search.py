@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaln
@@ -128,7 +129,7 @@ class Search:
     columns: dict[str, Moved | None] = field(default_factory=dict)
     identifiable: Identifiability = field(default_factory=lambda: Identifiability((), ()))
     diverged: tuple[str, ...] = ()
-    _proposed: dict = field(default_factory=dict, repr=False)
+    _proposed: dict[Any, Any] = field(default_factory=dict, repr=False)
     _densities: dict[tuple[FittedSet, FittedSet], np.ndarray] = field(default_factory=dict, repr=False)
 
     @cached_property

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaln
@@ -319,7 +320,7 @@ class Identifiability:
     unseen: tuple[str, ...]
     alike: tuple[Alike, ...]
 
-    def body(self) -> dict:
+    def body(self) -> dict[str, Any]:
         """The entry of the JSON document."""
         return {
             "unseen": list(self.unseen),

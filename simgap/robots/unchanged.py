@@ -291,7 +291,7 @@ def fit_old(composed: Composed, calibration: Calibration | None, unit: np.ndarra
     bend, missed = bend + 1e-9 * np.eye(p), np.zeros(m)
     for u in range(m):
 
-        def without(z: np.ndarray, u=u) -> float:
+        def without(z: np.ndarray, u: int = u) -> float:
             return runs.losses(theta.point(point, z), u)[0] + prior(z)[0]
 
         less = information.sum(0) - information[u] + bend
