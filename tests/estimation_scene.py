@@ -38,15 +38,13 @@ def make_design(num_trials=4, seed=0, deviations=0, objects=OBJECTS, count=40.0)
         shifts[channel == 0, 0], free_shifts[:, 1, 0] = 0.02, 0.02
     if deviations > 1:
         shifts[channel == 1, 1] = 3e-5
-    return Design(
-        unknowns=unknowns,
-        nuisances=tuple(Nuisance(f"deviation.{i}", 1.0, 1.0, _unread) for i in range(deviations)),
-        mean=np.zeros(len(rows)), variance=SD[channel] ** 2 * rng.uniform(0.5, 2.0, size=len(rows)),
-        coefficients=coefficients, shifts=shifts, channel=channel, unit=unit, trial=trial, move=move,
-        slope=np.zeros(len(rows), bool),
-        free_mean=np.zeros((num_trials, 4)), free_variance=np.full((num_trials, 4), 2e-3**2),
-        free_shifts=free_shifts, scale_count=np.full(3, count),
-    )  # fmt: skip
+    return Design(unknowns=unknowns,
+                  nuisances=tuple(Nuisance(f"deviation.{i}", 1.0, 1.0, _unread) for i in range(deviations)),
+                  mean=np.zeros(len(rows)), variance=SD[channel] ** 2 * rng.uniform(0.5, 2.0, size=len(rows)),
+                  coefficients=coefficients, shifts=shifts, channel=channel, unit=unit, trial=trial,
+                  move=move, slope=np.zeros(len(rows), bool), free_mean=np.zeros((num_trials, 4)),
+                  free_variance=np.full((num_trials, 4), 2e-3**2), free_shifts=free_shifts,
+                  scale_count=np.full(3, count))  # fmt: skip
 
 
 def drawn(design, seed, properties=None, scales=None):

@@ -22,6 +22,7 @@ TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for 
 
 Edit = Callable[[Trial, Sequence[float]], tuple[Trial, int]]
 FORCES = ("fx1", "fy1", "fx2", "fy2")
+END = np.inf
 
 
 def join(trial: Trial, *pieces: tuple[float, float]) -> Trial:
@@ -43,7 +44,6 @@ def let_go(trial: Trial, boundaries: Sequence[float], start: float, end: float) 
     return Trial(trial.file, trial.t, channels)
 
 
-END = np.inf
 EDITS: dict[str, Edit] = {
     # Block 1 falls in mid-carry, and nothing is held from there on, or block 2 is moved all the same.
     "drop_first": lambda t, b: (let_go(t, b, (b[1] + b[2]) / 2, END), 3),

@@ -8,9 +8,8 @@ import numpy as np
 def random_problem(num_timesteps, num_subtasks, seed=0, num_skips=0):
     rng = np.random.default_rng(seed)
     ll = rng.normal(size=(num_timesteps, num_subtasks)) * 2
-    bands = tuple(
-        rng.normal(size=(num_timesteps - 1, max(num_subtasks - d, 0))) - d for d in range(2 + num_skips)
-    )
+    bands = tuple(rng.normal(size=(num_timesteps - 1, max(num_subtasks - d, 0))) - d
+                  for d in range(2 + num_skips))  # fmt: skip
     return ll, bands
 
 

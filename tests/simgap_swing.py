@@ -36,9 +36,8 @@ class Swing:
         return {"angle": out}
 
 
-def log(
-    seed: int, seconds: float = 6.0, rate: float = 100.0, noise: float = 5e-4, **changed: float
-) -> Recording:
+def log(seed: int, seconds: float = 6.0, rate: float = 100.0, noise: float = 5e-4,
+        **changed: float) -> Recording:  # fmt: skip
     """A recording of a Swing with some parameters changed."""
     rng = np.random.default_rng(seed)
     t = np.arange(0.0, seconds, 1 / rate)

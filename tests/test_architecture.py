@@ -13,6 +13,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TREES = ("hmmseg", "estimation", "simgap", "hmmseg_cli", "experiments", "paper_figs", "tests")
 PATH = re.compile(rf"(?<![\w/.])((?:{'|'.join(TREES)})/[\w/]+\.(?:py|json|toml|j2|html))\b")
+FLOORS = ("experiments", "paper_figs", "hmmseg_cli", "simgap", "estimation", "hmmseg")
+ROOMS = ("online", "sequence", "segmentation", "hand", "contact", "io")  # of hmmseg, from the top down
+OURS = ("hmmseg", "estimation", "simgap", "hmmseg_cli", "experiments", "paper_figs")
 
 
 def defined(path: Path) -> set[str]:
@@ -48,9 +51,6 @@ def test_no_module_is_longer_than_one_idea_takes(tree):
     assert lines and {str(path): count for path, count in lines.items() if count > 700} == {}
 
 
-FLOORS = ("experiments", "paper_figs", "hmmseg_cli", "simgap", "estimation", "hmmseg")
-
-
 def imported_packages(nodes: Iterable[ast.AST]) -> set[str]:
     """Top packages that some statements of a module import; a relative import is its own package."""
     found = set()
@@ -80,9 +80,6 @@ def test_an_upward_import_is_seen():
     assert upward("simgap", "from hmmseg import task\nimport estimation") == set()
 
 
-ROOMS = ("online", "sequence", "segmentation", "hand", "contact", "io")  # of hmmseg, from the top down
-
-
 @pytest.mark.parametrize("room", ROOMS)
 def test_imports_within_hmmseg_run_downwards(room):
     """`Trial.read` alone looks up, to what judges a hand's recording: it is where users look for it."""
@@ -93,9 +90,6 @@ def test_imports_within_hmmseg_run_downwards(room):
                 seen = ".".join(node.module.split(".")[:2])
                 allowed = path.name == "trial.py" and node.module == "hmmseg.hand.read"
                 assert seen not in above or allowed, f"{path.relative_to(ROOT)} imports {node.module}"
-
-
-OURS = ("hmmseg", "estimation", "simgap", "hmmseg_cli", "experiments", "paper_figs")
 
 
 def imported_names(path: Path) -> list[tuple[str, str]]:

@@ -31,10 +31,8 @@ def blocks(text: str) -> list[tuple[str, str]]:
 def pages() -> list:
     found = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     with_examples = [path for path in found if blocks(path.read_text(encoding="utf-8"))]
-    return [
-        pytest.param(path, id=path.name, marks=[pytest.mark.slow] if path.name in SLOW else [])
-        for path in with_examples
-    ]
+    return [pytest.param(path, id=path.name, marks=[pytest.mark.slow] if path.name in SLOW else [])
+            for path in with_examples]  # fmt: skip
 
 
 def expanded(words: list[str]) -> list[str]:
@@ -49,8 +47,7 @@ def expanded(words: list[str]) -> list[str]:
 def test_docstrings(name):
     module = importlib.import_module(name)
     done = doctest.testmod(module, optionflags=doctest.ELLIPSIS)
-    assert done.attempted > 0
-    assert done.failed == 0
+    assert done.attempted > 0 and done.failed == 0
 
 
 @pytest.mark.parametrize("page", pages())

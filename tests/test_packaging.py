@@ -15,17 +15,8 @@ PRODUCT = tuple(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"
 OURS = {*PRODUCT, "experiments", "paper_figs", "tests"}
 # Import names that differ from the name that is installed.
 DISTRIBUTIONS = {"PIL": "pillow", "mcap_ros2": "mcap-ros2-support", "sklearn": "scikit-learn"}
-TOOLS = {
-    "ipykernel",
-    "build",
-    "furo",
-    "myst-parser",
-    "pre-commit",
-    "pyright",
-    "pytest-xdist",
-    "ruff",
-    "sphinx",
-}
+TOOLS = {"ipykernel", "build", "furo", "myst-parser", "pre-commit", "pyright", "pytest-xdist", "ruff",
+         "sphinx"}  # fmt: skip
 
 
 def requirement(text: str) -> str:
@@ -81,8 +72,7 @@ def test_the_solver_bug_of_mujoco_is_excluded_everywhere():
     entries = [e for extra in PROJECT["project"]["optional-dependencies"].values() for e in extra]
     entries += PROJECT["project"]["dependencies"]
     mujoco = [entry for entry in entries if requirement(entry) == "mujoco"]
-    assert mujoco
-    assert all("!=4.0.0" in entry for entry in mujoco)
+    assert mujoco and all("!=4.0.0" in entry for entry in mujoco)
 
 
 @pytest.mark.parametrize("package", PRODUCT)
@@ -92,7 +82,5 @@ def test_every_package_says_that_it_is_typed(package):
 
 def test_what_is_imported_is_seen():
     top, anywhere = imported("import os, numpy.linalg\nfrom PIL import Image\ndef f():\n    import h5py\n")
-    assert top == {"numpy", "pillow"}
-    assert anywhere == {"numpy", "pillow", "h5py"}
-    assert requirement("dask[distributed]>=2024.8") == "dask"
-    assert requirement("arviz >=0.20,<2") == "arviz"
+    assert top == {"numpy", "pillow"} and anywhere == {"numpy", "pillow", "h5py"}
+    assert requirement("dask[distributed]>=2024.8") == "dask" and requirement("arviz >=0.20,<2") == "arviz"

@@ -16,20 +16,16 @@ import simgap
 from hmmseg import InputError, Rig, Task, Trial, align, segment
 
 STACK = Path(__file__).parents[1] / "recordings" / "none_1"
-PUBLIC = {
-    hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose diagnose "
-    "example_folder fit identify segment simulate",
-    estimation: "Identification identify read_actual",
-    simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate",
-}
+PUBLIC = {hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose diagnose "
+          "example_folder fit identify segment simulate", estimation: "Identification identify read_actual",
+          simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate"}  # fmt: skip
 
 
 @pytest.mark.parametrize("package", PUBLIC, ids=lambda p: p.__name__)
 def test_what_is_public_is_listed_and_there(package):
     assert sorted(package.__all__) == PUBLIC[package].split()
     for name in package.__all__:
-        assert getattr(package, name) is not None
-        assert name in dir(package)
+        assert getattr(package, name) is not None and name in dir(package)
     assert {name for name in dir(package) if not name.startswith("__")} <= set(package.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = package.nothing
@@ -80,10 +76,8 @@ def test_a_process_whose_jax_is_single_precision_gets_the_same_answers(found):
     made = simgap.simulate(task, rig, found, seed=3)[0]
     model = simgap.VirtualModel(aligned.rig, aligned.task, made.blocks, {"block1": 0.13, "block2": 0.13})
     force = model.step([[0.10, 0.02], [0.15, 0.02]], [[0.0, 0.0], [0.0, 0.0]], 0.001)
-    double = [
-        aligned.segmentations[0].log_evidence, found.of("block1", "weight").mean(),
-        made.trial.channels["fx1"].sum(), force[0, 0],
-    ]  # fmt: skip
+    double = [aligned.segmentations[0].log_evidence, found.of("block1", "weight").mean(),
+              made.trial.channels["fx1"].sum(), force[0, 0]]  # fmt: skip
     assert single == pytest.approx(double, rel=1e-9)
 
 
@@ -115,21 +109,15 @@ def test_mistakes_say_what_to_write():
         simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": {"weight": 0.3}, "block2": {}})
     with pytest.raises(InputError, match="needs no fit"):
         hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
-    for none in (
-        lambda: segment([], STACK / "task.toml", STACK / "rig.toml"),
-        lambda: segment([], {"sequence": ["a", "b"]}),
-    ):
+    for none in (lambda: segment([], STACK / "task.toml", STACK / "rig.toml"),
+                 lambda: segment([], {"sequence": ["a", "b"]})):  # fmt: skip
         with pytest.raises(InputError, match="trials: none given; expected at least one trial"):
             none()
 
 
-CELLS = (
-    "import hmmseg\nfolder = hmmseg.example_folder()\n"
-    "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
-    "found[0]",
-    "print(f'{found[0]}')",
-    "found[0].plot()",
-)
+CELLS = ("import hmmseg\nfolder = hmmseg.example_folder()\n"
+         "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
+         "found[0]", "print(f'{found[0]}')", "found[0].plot()")  # fmt: skip
 
 
 def test_a_notebook_shows_every_result_once_and_every_plot():
@@ -143,8 +131,7 @@ def test_a_notebook_shows_every_result_once_and_every_plot():
     several, one, printed, plot = shown
     assert len(several) == len(one) == len(printed) == 1
     assert "pickup block1" in several[0].data["text/plain"] and "<table>" in one[0].data["text/html"]
-    assert "pickup block1" in printed[0].text
-    assert any("image/png" in output.data for output in plot)
+    assert "pickup block1" in printed[0].text and any("image/png" in output.data for output in plot)
 
 
 def test_results_are_text_though_rich_would_show_them_itself(found, monkeypatch):
@@ -213,8 +200,7 @@ def test_a_wrong_name_names_the_nearest(found):
 
 
 def test_plots_return_axes_and_save_where_asked(found, tmp_path):
-    assert len(found.segmentations[0].plot()) == 7
-    assert found.plot_estimates() is not None
+    assert len(found.segmentations[0].plot()) == 7 and found.plot_estimates() is not None
     assert len(found.plot_check()) == 2
     found.plot_posterior(str(tmp_path / "corner.png"))
     assert (tmp_path / "corner.png").stat().st_size > 10_000
@@ -229,9 +215,8 @@ def test_blocks_may_be_tables_of_their_properties():
 
 def test_an_identification_is_simulated_as_its_json_is(found, tmp_path):
     task = Task.read(STACK / "task.toml")
-    high = {
-        name: dataclasses.replace(f, lower_bound=1.5, mu_draws=None) for name, f in found.friction.items()
-    }
+    high = {name: dataclasses.replace(f, lower_bound=1.5, mu_draws=None)
+            for name, f in found.friction.items()}  # fmt: skip
     rough = dataclasses.replace(found, friction=high)
     (tmp_path / "found.json").write_text(json.dumps(rough.to_json()))
     blocks = simgap.simulate(task, STACK / "rig.toml", rough, seed=3)[0].blocks

@@ -16,10 +16,9 @@ def test_reads_values_with_deviations(tmp_path):
         '[block1.weight]\nunit = "N"\nvalue = 0.343\nsd = 0.0005\n'
         '[block2.height]\nunit = "m"\nvalue = 1\n[block2.friction]\nunit = "1"\nvalue = 1.2\nsd = 0.1\n'
     )
-    assert read_actual(path, ["block1", "block2"]) == {
-        "block1": {"weight": (0.343, 0.0005)},
-        "block2": {"height": (1.0, 0.0), "friction": (1.2, 0.1)},
-    }
+    assert read_actual(path, ["block1", "block2"]) == {"block1": {"weight": (0.343, 0.0005)},
+                                                       "block2": {"height": (1.0, 0.0),
+                                                                  "friction": (1.2, 0.1)}}  # fmt: skip
 
 
 @pytest.mark.parametrize("table, message", [
@@ -50,14 +49,9 @@ def test_a_missing_file_is_named(tmp_path):
         read_actual(tmp_path / "absent.toml", ["block1"])
 
 
-FOUND = {
-    "block1": {
-        "weight": {"mean": 0.4639, "sd": 0.0015, "interval_95": [0.461, 0.467]},
-        "width": {"mean": 0.036105, "sd": 1.6e-5, "interval_95": [0.03607, 0.03614]},
-        "height": None,
-        "friction": {"lower_bound": 0.5},
-    }
-}
+FOUND = {"block1": {"weight": {"mean": 0.4639, "sd": 0.0015, "interval_95": [0.461, 0.467]},
+                    "width": {"mean": 0.036105, "sd": 1.6e-5, "interval_95": [0.03607, 0.03614]},
+                    "height": None, "friction": {"lower_bound": 0.5}}}  # fmt: skip
 
 
 def test_a_wrong_measurement_is_remarked_on():

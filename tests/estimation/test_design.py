@@ -14,10 +14,9 @@ from experiments.worlds import simulated_cases
 from hmmseg.io.rig import Fingertip, Rig, Systematic
 from hmmseg.segmentation.align import align
 
-EVERY = Systematic(
-    force_bias=(0.01,) * 4, force_gain=(0.02,) * 4, joint_offset=(0.001,) * 4,
-    link_length=(0.001,) * 4, pad_stiffness=(0.1, 0.1),
-)  # fmt: skip
+EVERY = Systematic(force_bias=(0.01,) * 4, force_gain=(0.02,) * 4, joint_offset=(0.001,) * 4,
+                   link_length=(0.001,) * 4, pad_stiffness=(0.1, 0.1))  # fmt: skip
+NAMES = ("a", "b", "c", "d")
 
 
 @pytest.fixture(scope="module")
@@ -204,9 +203,6 @@ def test_alignments_are_combined_by_rubins_rule():
     assert row == pytest.approx(np.ones((2, 1)))
 
 
-NAMES = ("a", "b", "c", "d")
-
-
 def matrix(rows):
     return np.array([[row.get(name, 0) for name in NAMES] for row in rows], float).reshape(-1, len(NAMES))
 
@@ -222,11 +218,9 @@ def test_they_span_what_the_rises_span_and_single_out_what_is_determined(values)
     found = simplest_combinations(rises, NAMES)
     given_rows, rows = matrix(rises), matrix(found)
     rank = np.linalg.matrix_rank(given_rows) if len(given_rows) else 0
-    assert len(found) == rank
-    assert np.linalg.matrix_rank(np.concatenate([given_rows, rows])) == rank
+    assert len(found) == rank and np.linalg.matrix_rank(np.concatenate([given_rows, rows])) == rank
     _, singular, vt = np.linalg.svd(given_rows, full_matrices=True)
     null = vt[int((singular > 1e-9).sum()) :]
-    determined = {
-        n for n, column in zip(NAMES, null.T, strict=True) if np.abs(column).max(initial=0.0) < 1e-9
-    }
+    determined = {n for n, column in zip(NAMES, null.T, strict=True)
+                  if np.abs(column).max(initial=0.0) < 1e-9}  # fmt: skip
     assert {n for row in found if len(row) == 1 for n in row} == determined

@@ -24,6 +24,7 @@ SLIDE = {"object": "cup", "to": "ground", "slide": True}
 SLID = parse_task({"objects": {"cup": {"on": "ground"}}, "moves": [SLIDE]})
 BOTH = parse_task({"objects": {"cup": {"on": "ground"}}, "moves": [SLIDE, {"object": "cup", "to": "ground"}]})
 DURATION, RATE = 1.0, 20.0  # s of each subtask, samples per second
+NUM = int(5 * DURATION * RATE)
 
 
 def aligned(signals: Signals, task: BlockTask, boundaries: np.ndarray) -> WeighedTrial:
@@ -62,22 +63,16 @@ def planted(
         return values + offset + sd * rng.standard_normal(t.size)
 
     zero, sd_y = np.zeros(t.size), np.full(t.size, 2.5e-5)
-    signals = Signals(
-        t=t, x1=zero, y1=noisy(y, 2.5e-5), vx1=zero, vy1=zero,
-        fx1=noisy(grip, offset=bias), fy1=noisy(shear, offset=bias),
-        x2=zero, y2=noisy(y, 2.5e-5), vx2=zero, vy2=zero,
-        fx2=noisy(-grip, offset=bias), fy2=noisy(shear, offset=bias),
-        sd_x=sd_y, sd_y=sd_y, sd_vx=zero, sd_vy=zero, sd_force=SD,
-    )  # fmt: skip
+    signals = Signals(t=t, x1=zero, y1=noisy(y, 2.5e-5), vx1=zero, vy1=zero, fx1=noisy(grip, offset=bias),
+                      fy1=noisy(shear, offset=bias), x2=zero, y2=noisy(y, 2.5e-5), vx2=zero, vy2=zero,
+                      fx2=noisy(-grip, offset=bias), fy2=noisy(shear, offset=bias), sd_x=sd_y, sd_y=sd_y,
+                      sd_vx=zero, sd_vy=zero, sd_force=SD)  # fmt: skip
     return aligned(signals, task, boundaries)
 
 
 def wander(rng: np.random.Generator, size: int) -> np.ndarray:
     """Ratios of an uneven grip that stays clear of slipping."""
     return np.abs(0.15 + np.cumsum(rng.normal(0, 0.015, size)))
-
-
-NUM = int(5 * DURATION * RATE)
 
 
 @pytest.mark.parametrize("limit", [np.inf, 0.3])
@@ -94,8 +89,7 @@ def test_lower_bound_covers_the_largest_true_ratio_and_is_close(limit):
         below.append(bound <= ratio.max())
         gap.append(ratio.max() - bound)
         naive.append(seen.max() > ratio.max())
-    assert np.mean(below) >= 0.9 and np.mean(naive) > 0.6
-    assert np.median(gap) < 0.045
+    assert np.mean(below) >= 0.9 and np.mean(naive) > 0.6 and np.median(gap) < 0.045
 
 
 def test_one_sample_alone_does_not_carry_the_bound():
@@ -121,8 +115,7 @@ def test_bias_is_removed_and_noise_stated():
     rng = np.random.default_rng(4)
     ratio = np.where(np.arange(NUM) % 20 < 10, 0.25, 0.1)
     found = friction_posteriors([planted(LIFT, ratio, rng, bias=0.15)], LIFT, RIG, SD, rng)["cup"]
-    assert found.bound_draws is not None
-    assert np.median(found.bound_draws) == pytest.approx(0.25, abs=0.006)
+    assert found.bound_draws is not None and np.median(found.bound_draws) == pytest.approx(0.25, abs=0.006)
     assert found.lower_bound == np.quantile(found.bound_draws, 0.05) <= 0.25
 
 
@@ -131,8 +124,7 @@ def test_uncertain_force_gain_widens_the_bound():
     trial = planted(LIFT, np.full(NUM, 0.25), rng)
     rig = RIG.model_copy(update={"systematic": Systematic(force_gain=(0.05,) * 4)})
     found = friction_posteriors([trial], LIFT, rig, SD, rng)["cup"].bound_draws
-    assert found is not None
-    assert found.std() / found.mean() == pytest.approx(np.hypot(0.05, 0.05), rel=0.15)
+    assert found is not None and found.std() / found.mean() == pytest.approx(np.hypot(0.05, 0.05), rel=0.15)
 
 
 def test_nothing_held_gives_a_reason():
@@ -143,9 +135,8 @@ def test_nothing_held_gives_a_reason():
     assert found.to_json() == {"unit": "1", "lower_bound": None}
 
 
-def stretches(
-    rng: np.random.Generator, num: int, mu: float | None, drift: float = 0.0, scale: float = 2.5e-5
-) -> list[Stretch]:
+def stretches(rng: np.random.Generator, num: int, mu: float | None, drift: float = 0.0,
+              scale: float = 2.5e-5) -> list[Stretch]:  # fmt: skip
     """Fingers on a resting block under growing shear; beyond `mu` they slip at 3 mm/s."""
     out = []
     for _ in range(num):
@@ -170,8 +161,7 @@ def test_slip_is_seen_where_it_was_planted(mu, drift, seen):
         own = stretches(rng, 8, mu, drift)
         bound = np.full(100, mu or max(np.abs(s.ratio).max() for s in own))
         found = slip_evidence(own, stretches(rng, 8, None, drift), bound)
-        assert found.seen is seen
-        assert (found.probability > 0.5) is seen
+        assert found.seen is seen and (found.probability > 0.5) is seen
 
 
 def test_one_odd_stretch_is_no_slip():
@@ -217,10 +207,8 @@ def test_sliding_tells_the_friction_of_the_support(task, close):
         push = np.where(sliding, mu * (weight - down), 0.0)
         noise = SD * rng.standard_normal((4, s.t.size))
         held = trial.masks[0][[step.index for step in steps if step.state != FREE]].any(axis=0) * 1.5
-        vars(s).update(
-            fx1=held + push + noise[0], fx2=-held + noise[1], fy1=down / 2 + noise[2],
-            fy2=down / 2 + noise[3], vx1=sliding * 0.1, vx2=sliding * 0.1,
-        )  # fmt: skip
+        vars(s).update(fx1=held + push + noise[0], fx2=-held + noise[1], fy1=down / 2 + noise[2],
+                       fy2=down / 2 + noise[3], vx1=sliding * 0.1, vx2=sliding * 0.1)  # fmt: skip
         known = {"cup": rng.normal(weight, 0.01, 500)} if carried.any() else {}
         ground = friction_posteriors([trial], task, RIG, SD, rng, known)["cup"].ground
         assert ground is not None and ground.support == "ground"
@@ -236,9 +224,8 @@ def test_intervals_hold_however_few_samples_a_slide_has(monkeypatch):
     for _ in range(400):
         push = mu * (weight - down) + weight * lag + 0.01 * rng.standard_normal(6)
         monkeypatch.setattr("estimation.friction._rows", lambda *_, p=push: np.stack([p, lag, down], axis=1))
-        found = ground_friction(
-            [planted(SLID, np.zeros(100), rng)], SLID, subtasks(SLID), "cup", RIG, None, rng
-        )
+        found = ground_friction([planted(SLID, np.zeros(100), rng)], SLID, subtasks(SLID), "cup", RIG, None,
+                                rng)  # fmt: skip
         assert found is not None
         low, high = np.percentile(found.mu_draws, [2.5, 97.5])
         inside.append(low < mu < high)

@@ -7,6 +7,9 @@ from estimation.pads import MISSTATED, SLOPE_SD, UNSTATED, landing, misstated, p
 from estimation.pads import slope as slope_amid
 
 DT = 0.02
+STEP = 0.01
+TOUCH = 0.503  # s, between two samples
+STIFFNESS = 2500.0  # N/m, of both pads' mean shear
 
 
 def grip(share=0.0, lag=0.0, noise=0.0, seed=0):
@@ -17,11 +20,8 @@ def grip(share=0.0, lag=0.0, noise=0.0, seed=0):
     t = np.arange(0.0, 3.0, DT)
 
     def give(at):
-        return (
-            1.2e-3
-            * np.clip(np.minimum((at - 0.2) / 0.3, (2.8 - at) / 0.3), 0, 1)
-            * (1 + 0.05 * np.sin(4 * at))
-        )
+        return 1.2e-3 * np.clip(np.minimum((at - 0.2) / 0.3,
+                                           (2.8 - at) / 0.3), 0, 1) * (1 + 0.05 * np.sin(4 * at))  # fmt: skip
 
     recorded = give(t - lag)
     reading = 0.02 - (1 + share) * give(t) + recorded
@@ -112,11 +112,6 @@ def test_unstated_pads_may_give_what_slopes_show():
     assert possible_share(np.array([0.3]), np.array([0.1**2])) == pytest.approx(0.3)
     assert possible_share(np.array([0.0]), np.array([9.0])) == UNSTATED  # a slope that tells nothing
     assert possible_share(np.array([3.0]), np.array([0.01])) == pytest.approx(3.0)
-
-
-STEP = 0.01
-TOUCH = 0.503  # s, between two samples
-STIFFNESS = 2500.0  # N/m, of both pads' mean shear
 
 
 def landed(share=0.0, creep=0.0, noise=0.0, seed=0):

@@ -27,30 +27,32 @@ from hmmseg.segmentation.thresholds import (
     threshold,
 )
 
-STACK = BlockTask(
-    {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))
-)
+STACK = BlockTask({"block1": "block2", "block2": "ground"},
+                  (Move("block1", "ground"), Move("block2", "block1")))  # fmt: skip
 PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
 SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
 # fx1, fy1, fx2, fy2 [N], vx, vy [m/s] that show each state; s slides, 0 shows none.
-PATTERNS = {
-    "1": (0.0, 0.0, 0.0, 0.0, 0.2, 0.1),
-    "2": (2.0, 0.2, -2.0, 0.2, 0.2, 0.1),
-    "3": (2.0, -0.2, -2.0, 0.2, 0.0, 0.0),
-    "s": (2.0, -0.2, -2.0, -0.2, -0.2, 0.0),
-    "0": (2.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-}
+PATTERNS = {"1": (0.0, 0.0, 0.0, 0.0, 0.2, 0.1), "2": (2.0, 0.2, -2.0, 0.2, 0.2, 0.1),
+            "3": (2.0, -0.2, -2.0, 0.2, 0.0, 0.0), "s": (2.0, -0.2, -2.0, -0.2, -0.2, 0.0),
+            "0": (2.0, 0.0, 0.0, 0.0, 0.0, 0.0)}  # fmt: skip
+TOWER = BlockTask({"a": "b", "b": "c", "c": "ground"},
+                  (Move("a", "ground"), Move("b", "ground"), Move("c", "a")))  # fmt: skip
+WEIGHT = {"block1": 0.343, "block2": 0.437, "a": 0.2, "b": 0.3, "c": 0.4}
+WIDTH = {"block1": 0.0159, "block2": 0.0254, "a": 0.02, "b": 0.021, "c": 0.022}
+HEIGHT = {"block1": 0.016, "block2": 0.0127, "a": 0.01, "b": 0.011, "c": 0.013}
+PER_SUBTASK = 40
+# Height under the object at pickup and place, by move.
+RESTS = {"stack": ((HEIGHT["block2"], 0.0), (0.0, HEIGHT["block1"])),
+         "tower": ((HEIGHT["b"] + HEIGHT["c"], 0.0), (HEIGHT["c"], 0.0), (0.0, HEIGHT["a"]))}  # fmt: skip
 
 
 def make_signals(states: str, dt: float = 0.05) -> Signals:
     columns = np.array([PATTERNS[s] for s in states]).T
     fx1, fy1, fx2, fy2, vx, vy = columns
     zero = np.zeros(len(states))
-    return Signals(
-        t=np.arange(len(states)) * dt, x1=zero, y1=zero, vx1=vx, vy1=vy, fx1=fx1, fy1=fy1,
-        x2=zero + 0.02, y2=zero, vx2=vx, vy2=vy, fx2=fx2, fy2=fy2,
-        sd_x=zero, sd_y=zero, sd_vx=zero, sd_vy=zero, sd_force=0.01,
-    )  # fmt: skip
+    return Signals(t=np.arange(len(states)) * dt, x1=zero, y1=zero, vx1=vx, vy1=vy, fx1=fx1, fy1=fy1,
+                   x2=zero + 0.02, y2=zero, vx2=vx, vy2=vy, fx2=fx2, fy2=fy2, sd_x=zero, sd_y=zero,
+                   sd_vx=zero, sd_vy=zero, sd_force=0.01)  # fmt: skip
 
 
 def segment(states: str, task, **options):
@@ -86,8 +88,7 @@ def test_rules_ask_for_every_component_beyond_its_threshold(state, change, optio
 def test_missing_sample_is_unidentified_only_where_its_signal_is_needed(state, name, expected):
     signals = replace(make_signals(state), **{name: np.array([np.nan])})
     labels = label_states(signals)
-    assert labels.state[0] == expected
-    assert not labels.sliding[0]
+    assert labels.state[0] == expected and not labels.sliding[0]
 
 
 def test_clean_sequence_has_its_boundaries_half_way_between_samples():
@@ -129,9 +130,8 @@ def test_ground_sliding_counts_as_hold_on_ground_unless_the_move_is_a_slide():
     slid = segment("111" + "33" + "ssss" + "33" + "11", SLIDE)
     assert [s.subtask for s in slid.spans] == ["pregrasp", "pickup", "slide", "place", "release"]
     np.testing.assert_allclose(starts(slid)[1:], (np.array([3, 5, 9, 11]) - 0.5) * 0.05)
-    np.testing.assert_allclose(
-        starts(segment("111" + "33" + "ssss" + "33" + "11", SLIDE, order=first_change_order)), starts(slid)
-    )
+    np.testing.assert_allclose(starts(segment("111" + "33" + "ssss" + "33" + "11", SLIDE,
+                                              order=first_change_order)), starts(slid))  # fmt: skip
 
 
 def test_a_move_that_never_happens_fails_at_its_pickup_and_keeps_the_rest():
@@ -191,20 +191,6 @@ def test_monotone_order_against_enumeration(states):
         assert out.agreement >= first_change_order(labels, steps).agreement
 
 
-TOWER = BlockTask(
-    {"a": "b", "b": "c", "c": "ground"}, (Move("a", "ground"), Move("b", "ground"), Move("c", "a"))
-)
-WEIGHT = {"block1": 0.343, "block2": 0.437, "a": 0.2, "b": 0.3, "c": 0.4}
-WIDTH = {"block1": 0.0159, "block2": 0.0254, "a": 0.02, "b": 0.021, "c": 0.022}
-HEIGHT = {"block1": 0.016, "block2": 0.0127, "a": 0.01, "b": 0.011, "c": 0.013}
-PER_SUBTASK = 40
-# Height under the object at pickup and place, by move.
-RESTS = {
-    "stack": ((HEIGHT["block2"], 0.0), (0.0, HEIGHT["block1"])),
-    "tower": ((HEIGHT["b"] + HEIGHT["c"], 0.0), (HEIGHT["c"], 0.0), (0.0, HEIGHT["a"])),
-}
-
-
 def make(task: BlockTask, rests, seed: int | None = None) -> tuple[Signals, Segmentation]:
     """One trial whose subtasks last 40 samples each, with scatter if a seed is given."""
     steps = subtasks(task)
@@ -217,9 +203,8 @@ def make(task: BlockTask, rests, seed: int | None = None) -> tuple[Signals, Segm
     for i, step in enumerate(steps):
         inside = slice(i * PER_SUBTASK, (i + 1) * PER_SUBTASK)
         start, end = t[inside][0] - 0.025, t[inside][-1] + 0.025
-        spans.append(
-            Span(step.name, step.object, step.state, start, end, 0.0, 0.0, (start, start), (end, end))
-        )
+        spans.append(Span(step.name, step.object, step.state, start, end, 0.0, 0.0, (start, start),
+                          (end, end)))  # fmt: skip
         if step.state == FREE:
             continue
         assert step.move is not None
@@ -291,8 +276,7 @@ def test_what_the_task_or_the_recording_withholds_is_none_with_a_reason():
     names = {"block1": "block", "block2": "block"}
     spans = tuple(replace(s, object=names[str(s.object)]) for s in segmentation.spans[: len(steps)])
     properties, reasons = estimate_plugin([stack], [replace(segmentation, spans=spans)], PICK)
-    assert properties["block"]["height"] is None
-    assert "height" in reasons["block.height"]
+    assert properties["block"]["height"] is None and "height" in reasons["block.height"]
     assert properties["block"]["weight"] is not None
 
     half = replace(segmentation, spans=segmentation.spans[:5])  # the second move is missing

@@ -65,18 +65,15 @@ def test_the_conditional_gaussian_is_that_of_the_joint_one(deviations):
         found = np.linalg.inv(chol @ chol.T)
         scale = np.sqrt(np.diag(covariance))
         np.testing.assert_allclose(mean / scale, gain @ data / scale, atol=1e-2)
-        np.testing.assert_allclose(
-            found / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-2
-        )
+        np.testing.assert_allclose(found / np.outer(scale, scale), covariance / np.outer(scale, scale),
+                                   atol=1e-2)  # fmt: skip
 
 
 def test_a_channel_without_observations_keeps_its_prior():
     design, *_ = drawn(make_design(objects=("left",)), 4)
     kept = design.channel < 2
-    less = {
-        k: getattr(design, k)[kept]
-        for k in ("mean", "variance", "shifts", "channel", "unit", "trial", "move", "slope")
-    }
+    less = {k: getattr(design, k)[kept]
+            for k in ("mean", "variance", "shifts", "channel", "unit", "trial", "move", "slope")}  # fmt: skip
     cut = replace(design, unknowns=design.unknowns[:2], coefficients=design.coefficients[kept][:, :2], **less)
     post = posterior(cut)
     theta = np.zeros((3, 6))
@@ -106,13 +103,11 @@ def with_slopes(design, seed=11):
     """The design with a slope beside each mean of widths and heights, and what it stands for."""
     means = np.flatnonzero(design.channel > 0)
     rng = np.random.default_rng(seed)
-    more = {
-        "mean": 0.2 * rng.normal(size=means.size), "variance": np.full(means.size, 0.1**2),
-        "coefficients": np.zeros((means.size, len(design.unknowns))),
-        "shifts": 0.1 * rng.normal(size=(means.size, len(design.nuisances))),
-        "channel": design.channel[means], "unit": np.ones(means.size), "trial": design.trial[means],
-        "move": design.move[means], "slope": np.ones(means.size, bool),
-    }  # fmt: skip
+    more = {"mean": 0.2 * rng.normal(size=means.size), "variance": np.full(means.size, 0.1**2),
+            "coefficients": np.zeros((means.size, len(design.unknowns))),
+            "shifts": 0.1 * rng.normal(size=(means.size, len(design.nuisances))),
+            "channel": design.channel[means], "unit": np.ones(means.size), "trial": design.trial[means],
+            "move": design.move[means], "slope": np.ones(means.size, bool)}  # fmt: skip
     joined = {k: np.concatenate([getattr(design, k), v]) for k, v in more.items()}
     return replace(design, **joined), means
 

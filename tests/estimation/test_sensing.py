@@ -34,6 +34,8 @@ TABLE = {name: v.to_numpy(float) for name, v in pd.read_csv(FOLDER / "trial_01.c
 
 PLACE = np.arange(TABLE["t"].size)
 NAMES = [name for name in TABLE if name != "t"]
+QUICK = ("frozen force", "constant", "frozen encoder", "wild cell", "saturated", "drifting zero", "twice",
+         "one finger", "one vertical", "clock")  # fmt: skip
 
 
 def at(share):
@@ -97,18 +99,12 @@ ALTERED = {
 }  # fmt: skip
 
 
-QUICK = ("frozen force", "constant", "frozen encoder", "wild cell", "saturated", "drifting zero", "twice",
-         "one finger", "one vertical", "clock")  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in ALTERED]
-)
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow)
+                                  for n in ALTERED])  # fmt: skip
 def test_what_a_sensor_cannot_have_read_is_named_and_no_number_hangs_on_it(name):
     alter, named = ALTERED[name]
-    assert_no_number_misleads(
-        identify(TABLE | alter(TABLE), FOLDER / "task.toml", FOLDER / "rig.toml"), named
-    )
+    assert_no_number_misleads(identify(TABLE | alter(TABLE), FOLDER / "task.toml", FOLDER / "rig.toml"),
+                              named)  # fmt: skip
 
 
 def assert_no_number_misleads(found, named):
@@ -141,12 +137,10 @@ def hand(wider=0.0, higher=0.0, **links):
     return alter
 
 
-RIGS = {
-    "wider by 5 cm": (hand(wider=0.05), "comes 3. mm within a block that stands"),
-    "links too long": (hand(links1=1.1, links2=1.1), "is held .* mm beneath its bottom"),
-    "links too short": (hand(links1=0.9, links2=0.9), "is held .* mm above its top"),
-    "one finger's links": (hand(links1=1.1), "distance changes by 9.5 cm a metre"),
-}
+RIGS = {"wider by 5 cm": (hand(wider=0.05), "comes 3. mm within a block that stands"),
+        "links too long": (hand(links1=1.1, links2=1.1), "is held .* mm beneath its bottom"),
+        "links too short": (hand(links1=0.9, links2=0.9), "is held .* mm above its top"),
+        "one finger's links": (hand(links1=1.1), "distance changes by 9.5 cm a metre")}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -223,12 +217,9 @@ def test_a_recording_without_noise_may_stand_still():
     rig = read_rig(FOLDER / "rig.toml")
     t = TABLE["t"]
     way = np.interp(t, [0.0, 2.0, 4.0, 6.0, 10.0], [0.0, 0.0, 1.0, 1.0, 0.3])
-    smooth = {"t": t} | {
-        name: -1.0 + 0.1 * (i + 1) * way for i, name in enumerate(("q11", "q12", "q21", "q22"))
-    }
+    smooth = {"t": t} | {name: -1.0 + 0.1 * (i + 1) * way
+                         for i, name in enumerate(("q11", "q12", "q21", "q22"))}  # fmt: skip
     smooth |= {f"d{name}": np.gradient(values, t) for name, values in smooth.items() if name != "t"}
-    smooth |= {
-        name: sign * np.clip(way - 0.5, 0.0, 1.0)
-        for name, sign in zip(FORCES, (1, 0.1, -1, 0.1), strict=True)
-    }
+    smooth |= {name: sign * np.clip(way - 0.5, 0.0, 1.0)
+               for name, sign in zip(FORCES, (1, 0.1, -1, 0.1), strict=True)}  # fmt: skip
     assert read_trial(smooth, rig).faults == ()

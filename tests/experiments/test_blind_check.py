@@ -65,8 +65,7 @@ def test_a_table_yields_by_the_load_and_tilts_about_its_pivot():
     x = data.joint("x_block1").qpos[0]
     assert data.joint("turn_block1").qpos[0] == pytest.approx(0.03, abs=2e-4)
     along = 0.165 + x - PIVOT
-    assert 0.0102 + z[-1] == pytest.approx(0.03 * along + 0.0085, abs=3e-5)
-    assert abs(x) < 5e-4
+    assert 0.0102 + z[-1] == pytest.approx(0.03 * along + 0.0085, abs=3e-5) and abs(x) < 5e-4
 
 
 def test_fingers_carry_the_weight_and_nothing_in_free_motion(motion):
@@ -201,10 +200,8 @@ def test_worlds_are_drawn_apart_and_noise_is_as_drawn(motion):
 
 
 def test_a_finger_may_close_first_and_the_truth_is_of_the_grip():
-    together, apart = (
-        perform(plan(TASK, BLOCKS, HEALTHY, Style(stagger=(s, s)), np.random.default_rng(4)), BLOCKS, HEALTHY)
-        for s in (0.0, 0.08)
-    )
+    together, apart = (perform(plan(TASK, BLOCKS, HEALTHY, Style(stagger=(s, s)), np.random.default_rng(4)),
+                               BLOCKS, HEALTHY) for s in (0.0, 0.08))  # fmt: skip
     for motion in (together, apart):
         touch = np.searchsorted(motion.t, motion.boundaries[0])
         both = (motion.force[:, 0] > 2e-3) & (-motion.force[:, 2] > 2e-3)

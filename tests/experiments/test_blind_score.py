@@ -23,14 +23,13 @@ def said(verdict: str, causes: list[str], partners: list[str] = (), **more) -> d
     """A diagnosis made by hand."""
     name = "+".join(causes) or verdict
     effects = {c: {"parameters": more.pop("parameters", {})} for c in causes[:1]}
-    body = {
-        "verdict": verdict, "causes": causes, "indistinguishable": list(partners),
-        "probabilities": {name: 0.95, "other": 0.05}, "effects": effects,
-        "attribution": {c: {"probability": 0.95, "share": 0.9} for c in causes},
-        "remainder": {"share": 0.1, "p_value": 0.5, "where": []},
-        "where": [{"channel": "fy", "subtask": "carry block1"}, {"channel": "x", "subtask": "place block1"}],
-        "shrinkage": None, "bic": "force_bias", "gains": {}, "seconds": 10.0,
-    }  # fmt: skip
+    body = {"verdict": verdict, "causes": causes, "indistinguishable": list(partners),
+            "probabilities": {name: 0.95, "other": 0.05}, "effects": effects,
+            "attribution": {c: {"probability": 0.95, "share": 0.9} for c in causes},
+            "remainder": {"share": 0.1, "p_value": 0.5, "where": []},
+            "where": [{"channel": "fy", "subtask": "carry block1"},
+                      {"channel": "x", "subtask": "place block1"}], "shrinkage": None, "bic": "force_bias",
+            "gains": {}, "seconds": 10.0}  # fmt: skip
     return body | more
 
 
@@ -40,9 +39,8 @@ def test_the_scorer_counts_hand_made_results():
     lag, both = {"force_lag": {"delay": 0.1}}, {"force_bias": {}, "force_lag": {}}
     hum, dense = {"mains_hum": {"amplitude": 0.1}}, {"force_bias": {}, "force_lag": {}, "table_tilt": {}}
     rest = {"remainder": {"share": 0.5, "p_value": 0.0, "where": []}}
-    wide = entry("m", "dense", dense, 0.05) | {
-        "sizes": {"force_bias": 0.8, "force_lag": 0.1, "table_tilt": 0.05}
-    }
+    wide = entry("m", "dense", dense, 0.05) | {"sizes": {"force_bias": 0.8, "force_lag": 0.1,
+                                                         "table_tilt": 0.05}}  # fmt: skip
     rows = [
         judge_case(entry("a", "healthy", {}), said("none", [], where=[])),
         judge_case(entry("b", "healthy", {}), said("named", ["force_lag"], where=[])),
@@ -69,12 +67,10 @@ def test_the_scorer_counts_hand_made_results():
     assert (table["outside_right"]["hits"], table["outside_right"]["count"]) == (2, 3)
     assert table["withheld_right"]["value"] == 0.5
     assert table["pair_both"]["value"] == 1.0 and table["dense_dominant"]["value"] == 1.0
-    assert table["coverage_90"]["value"] == 0.5
-    assert table["small_none"]["value"] == 1.0
+    assert table["coverage_90"]["value"] == 0.5 and table["small_none"]["value"] == 1.0
     assert table["inclusion_dense"]["value"] == pytest.approx(0.05)
     # Of each but the healthy ones: one hit, one false, one missed cell.
-    assert table["location_f1"]["value"] == pytest.approx(0.5)
-    assert table["bic_named"]["hits"] == 2
+    assert table["location_f1"]["value"] == pytest.approx(0.5) and table["bic_named"]["hits"] == 2
     assert found["brackets"]["rate"]["20 Hz"]["false_alarms"]["value"] == 0.5
     low, high = table["false_alarms"]["interval_95"]
     assert low == pytest.approx(0.0126, abs=1e-3) and high == pytest.approx(0.9874, abs=1e-3)
@@ -83,13 +79,8 @@ def test_the_scorer_counts_hand_made_results():
 def test_a_recording_that_is_refused_counts_and_is_wrong():
     refused = {"error": "does not fit its task", "seconds": 1.0}
     one, two = {"force_bias": {"fy1": 0.1}}, {"force_bias": {}, "force_lag": {}}
-    tiers = (
-        ("healthy", {}),
-        ("single", one),
-        ("pair", two),
-        ("outside", {"mains_hum": {}}),
-        ("withheld", one),
-    )
+    tiers = (("healthy", {}), ("single", one), ("pair", two), ("outside", {"mains_hum": {}}),
+             ("withheld", one))  # fmt: skip
     table = figures([judge_case(entry(tier, tier, effects), refused) for tier, effects in tiers])["table"]
     assert table["false_alarms"]["value"] == 1.0 and table["errors"]["value"] == 1.0
     for name in ("named_right", "set_right", "outside_right", "withheld_right", "pair_both"):

@@ -29,8 +29,7 @@ def test_rigid_fingertips_make_widths_short_by_what_the_pads_give(shortfalls):
         rows = [row for row in shortfalls if row["object"] == name]
         assert 1.0e-3 < np.mean([row["short"] for row in rows]) < 1.6e-3
     for row in shortfalls:
-        assert row["short"] == pytest.approx(row["predicted"], abs=3e-5)
-        assert abs(row["remaining"]) < 3e-5
+        assert row["short"] == pytest.approx(row["predicted"], abs=3e-5) and abs(row["remaining"]) < 3e-5
 
 
 def test_pad_stiffness_and_width_follow_from_the_recordings_alone(case):
@@ -67,8 +66,7 @@ def test_slip_adds_to_the_height_with_its_sign(case):
 
 def test_recordings_with_slip_have_block_1_short_and_block_2_long():
     found = slip.heights(sources.recorded("grip_slip_1"))
-    assert found["block1"]["compliant"]["mean"] < -1e-4
-    assert found["block2"]["compliant"]["mean"] > 1e-4
+    assert found["block1"]["compliant"]["mean"] < -1e-4 and found["block2"]["compliant"]["mean"] > 1e-4
 
 
 def test_saved_numbers_are_those_of_the_recordings(case):
@@ -101,9 +99,8 @@ def test_what_the_page_claims_in_words():
 
 def test_results_are_written_without_nan_and_read_back(monkeypatch, tmp_path):
     monkeypatch.setattr(sources, "RESULTS", tmp_path)
-    sources.save(
-        "some", {"a": np.array([1.23456789, np.nan, -0.0]), "b": [{"c": True, "d": np.int64(3)}], "e": []}
-    )
+    sources.save("some", {"a": np.array([1.23456789, np.nan, -0.0]), "b": [{"c": True, "d": np.int64(3)}],
+                          "e": []})  # fmt: skip
     text = (tmp_path / "some.json").read_text(encoding="utf-8")
     read = json.loads(text)
     assert read.pop("made_by", None) == commit_of()

@@ -40,11 +40,9 @@ def test_snap_boundaries(shared, kind, decided):
     taught, clock = hiro_snap.with_labels(trials, description, hiro_snap.WRENCH_AND_POSE, seed=11)
     assert max(hiro_snap.summary(taught)["median_abs"]) <= 0.06
     assert np.median(np.abs(clock)) > 0.2  # the crop leaves the clock nothing
-    alone = hiro_snap.summary(
-        hiro_snap.without_labels(trials, description, hiro_snap.WRENCH_AND_POSE, seed=11)
-    )
-    assert min(np.array(alone["within_0.3"])[decided]) == 1.0
-    assert min(alone["coverage_90"]) == 1.0
+    alone = hiro_snap.summary(hiro_snap.without_labels(trials, description, hiro_snap.WRENCH_AND_POSE,
+                                                       seed=11))  # fmt: skip
+    assert min(np.array(alone["within_0.3"])[decided]) == 1.0 and min(alone["coverage_90"]) == 1.0
 
 
 @pytest.mark.slow

@@ -28,10 +28,8 @@ TRUTH = (1.0, 2.0, 3.0, 4.0)
 
 def make(starts, number=5) -> Segmentation:
     edges = [0.0, *starts, 5.0]
-    spans = [
-        Span(s.name, s.object, s.state, a, b, 0.1, 0.1, (a - 0.1, a + 0.1), (b - 0.1, b + 0.1))
-        for s, a, b in zip(STEPS, edges, edges[1:], strict=False)
-    ]
+    spans = [Span(s.name, s.object, s.state, a, b, 0.1, 0.1, (a - 0.1, a + 0.1), (b - 0.1, b + 0.1))
+             for s, a, b in zip(STEPS, edges, edges[1:], strict=False)]  # fmt: skip
     return Segmentation("made.csv", 20.0, None, tuple(spans[:number]))
 
 
@@ -65,9 +63,8 @@ def test_properties_against_truth():
     assert scores[0]["residual"] == pytest.approx(0.1)
     assert (scores[0]["in_68"], scores[0]["in_95"]) == (False, True)
     summary = summarise_properties(scores)
-    assert summary["weight"] == pytest.approx(
-        {"count": 1, "null": 0, "rms": 0.1, "coverage_68": 0.0, "coverage_95": 1.0}
-    )
+    assert summary["weight"] == pytest.approx({"count": 1, "null": 0, "rms": 0.1, "coverage_68": 0.0,
+                                               "coverage_95": 1.0})  # fmt: skip
     assert summary["width"] == {"count": 0, "null": 1} and summary["height"] == {"count": 0, "null": 0}
 
 

@@ -26,14 +26,11 @@ def test_fill_replaces_what_stands_between_the_markers():
 
 def test_every_table_has_what_writes_it_and_a_target():
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
-    marked = {
-        (str(page.relative_to(ROOT)), name)
-        for page in pages
-        for name in re.findall(r"^<!-- (\w+) -->$", page.read_text(encoding="utf-8"), re.MULTILINE)
-    }
-    assert marked - {("docs/reproduction.md", "results")} == {
-        (page, name) for page, name, *_ in TABLES if name
-    }
+    marked = {(str(page.relative_to(ROOT)), name) for page in pages
+              for name in re.findall(r"^<!-- (\w+) -->$", page.read_text(encoding="utf-8"),
+                                     re.MULTILINE)}  # fmt: skip
+    assert marked - {("docs/reproduction.md", "results")} == {(page, name) for page, name, *_ in TABLES
+                                                              if name}  # fmt: skip
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     for target in {target for *_, target in TABLES}:
         assert re.search(rf"^{target}: ", makefile, re.MULTILINE), target
@@ -76,9 +73,8 @@ def trial():
 def test_a_rig_that_knows_the_links_reads_the_true_tips(trial):
     rig, _ = scene()
     changed = deviated(trial, rig, hand(link_length=0.01, joint_offset=0.002))
-    true = {
-        i: f.model_copy(update={"links": tuple(1.01 * x for x in f.links)}) for i, f in rig.fingers.items()
-    }
+    true = {i: f.model_copy(update={"links": tuple(1.01 * x for x in f.links)})
+            for i, f in rig.fingers.items()}  # fmt: skip
     channels = {k: v - 0.002 if k.startswith("q") else v for k, v in changed.channels.items()}
     knowing = task_space(type(trial)(trial.file, trial.t, channels), rig.model_copy(update={"fingers": true}))
     expected = task_space(trial, rig)

@@ -46,15 +46,12 @@ def cartesian(case):
     return [trial], Rig(rate=20.0, fingertip=case.rig.fingertip, noise=noise)
 
 
-HANDS = {
-    "as stated": lambda case: (list(case.trials[:2]), case.rig),
-    "noise unstated": lambda case: (list(case.trials[:2]), case.rig.model_copy(update={"noise": Noise()})),
-    "rigid pads": lambda case: (
-        list(case.trials[:2]),
-        case.rig.model_copy(update={"fingertip": Fingertip()}),
-    ),
-    "Cartesian": cartesian,
-}
+HANDS = {"as stated": lambda case: (list(case.trials[:2]), case.rig),
+         "noise unstated": lambda case: (list(case.trials[:2]),
+                                         case.rig.model_copy(update={"noise": Noise()})),
+         "rigid pads": lambda case: (list(case.trials[:2]),
+                                     case.rig.model_copy(update={"fingertip": Fingertip()})),
+         "Cartesian": cartesian}  # fmt: skip
 
 
 @pytest.mark.parametrize("hand", HANDS)

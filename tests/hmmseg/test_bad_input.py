@@ -30,16 +30,39 @@ from simgap.world.operator import OperatorSettings, read_operator
 from simgap.world.properties import read_properties
 
 TASK = parse_task({"objects": {"a": {"on": "ground"}}, "moves": [{"object": "a", "to": "ground"}]})
-READERS = {
-    "trial": lambda path: read_trial(path, parse_rig({})),
-    "model": lambda path: load_model(path, parse_task({"sequence": ["a", "b"]})),
-    "rig": read_rig,
-    "task": read_task,
-    "operator": read_operator,
-    "properties": lambda path: read_properties(path, TASK),
-}
+READERS = {"trial": lambda path: read_trial(path, parse_rig({})),
+           "model": lambda path: load_model(path, parse_task({"sequence": ["a", "b"]})), "rig": read_rig,
+           "task": read_task, "operator": read_operator,
+           "properties": lambda path: read_properties(path, TASK)}  # fmt: skip
 STACK = Path(__file__).parents[1] / "data/stack"
 MOVES = (example_folder() / "task.toml").read_text(encoding="utf-8")
+SOME = settings(max_examples=int(os.environ.get("HMMSEG_EXAMPLES", "60")), deadline=None,
+                suppress_health_check=[HealthCheck.function_scoped_fixture])  # fmt: skip
+CARTESIAN = ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")
+CELLS = st.one_of(st.floats().map(repr), st.integers().map(str),
+                  st.sampled_from(["", " ", "nan", "-inf", "1,5", "0x1", "1e400", '"', "\x00", "٣",
+                                   "9" * 400]), st.text(max_size=6))  # fmt: skip
+VALUES = st.recursive(
+    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=12,
+)  # fmt: skip
+KEYS = ("rate", "gravity", "fingertip", "noise", "systematic", "tolerance", "columns", "topics", "gripper",
+        "fingers", "effects", "objects", "moves", "repeat", "sequence", "channels", "optional")  # fmt: skip
+SETTINGS = st.sampled_from(sorted(OperatorSettings.model_fields))
+DOCUMENTS = st.one_of(
+    VALUES,
+    st.dictionaries(SETTINGS, VALUES, max_size=3),
+    st.fixed_dictionaries({"properties": st.fixed_dictionaries({"a": VALUES})}),
+)
+LAB = example_folder()
+STREAM = (LAB / "trial_01.csv").read_bytes().splitlines()
+LINES = st.lists(st.one_of(st.integers(1, 60).map(lambda k: STREAM[k]), st.binary(max_size=40),
+                           st.tuples(st.integers(1, 60), st.integers(0, 12), CELLS)),
+                 max_size=25)  # fmt: skip
+ARRAYS = st.one_of(st.floats(), st.integers(-5, 5), st.text(max_size=4),
+                   st.lists(st.floats(), max_size=3), st.just(np.zeros((2, 0))))  # fmt: skip
+EDITS = st.lists(st.tuples(st.integers(0, 40), st.one_of(st.none(), ARRAYS)), min_size=1, max_size=3)
 
 
 def told(call, *arguments):
@@ -47,8 +70,7 @@ def told(call, *arguments):
     with pytest.raises(InputError) as error:
         call(*arguments)
     line = str(error.value)
-    assert "\n" not in line
-    assert len(line) < 2000
+    assert "\n" not in line and len(line) < 2000
     return line
 
 
@@ -106,10 +128,8 @@ def test_a_table_without_a_header(tmp_path):
 
 
 @pytest.mark.parametrize("read", ["rig", "task"])
-@pytest.mark.parametrize(
-    "content",
-    ["a = " + "[" * 100_000, "a" + ".a" * 100_000 + " = 1", "x = 1\n" * 400_000, "a = " + "9" * 100_000],
-)
+@pytest.mark.parametrize("content", ["a = " + "[" * 100_000, "a" + ".a" * 100_000 + " = 1",
+                                     "x = 1\n" * 400_000, "a = " + "9" * 100_000])  # fmt: skip
 def test_toml_bombs(content, read, tmp_path):
     path = tmp_path / "bomb.toml"
     path.write_text(content)
@@ -129,12 +149,10 @@ def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
     Path("bad.csv").write_text("t,x1\n0,zero\n")
     before = sorted(tmp_path.rglob("*"))
     hand = ["--task", "task.toml", "--rig", str(STACK / "rig.toml")]
-    for command in (
-        ["segment", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--write", "w"],
-        ["identify", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--report", "r.html"],
-        ["inspect", "bad.csv", "--write", "bad.toml", "--json", "a.json"],
-        ["simulate", *hand, "--properties", "bad.csv", "--output", "s"],
-    ):
+    for command in (["segment", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--write", "w"],
+                    ["identify", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--report",
+                     "r.html"], ["inspect", "bad.csv", "--write", "bad.toml", "--json", "a.json"],
+                    ["simulate", *hand, "--properties", "bad.csv", "--output", "s"]):  # fmt: skip
         assert main(command) == 2
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1, lines
@@ -149,8 +167,7 @@ def test_a_recording_that_stops_halfway_is_no_replay(tmp_path, capsys):
     before = sorted(tmp_path.rglob("*"))
     replay = ["--replay", str(tmp_path / "half.csv"), "--output", str(tmp_path / "made")]
     assert main(["simulate", *hand, *replay]) == 2
-    assert "does not show the whole task" in capsys.readouterr().err
-    assert sorted(tmp_path.rglob("*")) == before
+    assert "does not show the whole task" in capsys.readouterr().err and sorted(tmp_path.rglob("*")) == before
 
 
 @pytest.mark.parametrize(("read", "content"), [
@@ -176,9 +193,8 @@ def unheard_of(path):
 HOSTILE = [pickled, bare_pickle, zip_bomb, huge_claim, climbing]
 
 
-@pytest.mark.parametrize(
-    ("read", "make"), [*(("trial", m) for m in HOSTILE), *(("model", m) for m in (*HOSTILE, unheard_of))]
-)
+@pytest.mark.parametrize(("read", "make"), [*(("trial", m) for m in HOSTILE),
+                                            *(("model", m) for m in (*HOSTILE, unheard_of))])  # fmt: skip
 def test_a_hostile_archive_is_refused_and_runs_nothing(read, make, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "t.npz"
@@ -192,23 +208,6 @@ def test_an_archive_that_unpacks_to_much_more_than_it_has_is_refused(tmp_path, m
     np.savez_compressed(tmp_path / "t.npz", t=np.zeros(10**7))
     for read in ("trial", "model"):
         assert "unpacks from" in told(READERS[read], tmp_path / "t.npz")
-
-
-SOME = settings(
-    max_examples=int(os.environ.get("HMMSEG_EXAMPLES", "60")), deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)  # fmt: skip
-CARTESIAN = ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")
-CELLS = st.one_of(
-    st.floats().map(repr), st.integers().map(str),
-    st.sampled_from(["", " ", "nan", "-inf", "1,5", "0x1", "1e400", '"', "\x00", "٣", "9" * 400]),
-    st.text(max_size=6),
-)  # fmt: skip
-VALUES = st.recursive(
-    st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
-    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
-    max_leaves=12,
-)  # fmt: skip
 
 
 def one_line(call, *arguments):
@@ -252,23 +251,11 @@ def test_tables(folder, text):
         assert all(c.shape == trial.t.shape and not np.isinf(c).any() for c in trial.channels.values())
 
 
-KEYS = ("rate", "gravity", "fingertip", "noise", "systematic", "tolerance", "columns", "topics", "gripper",
-        "fingers", "effects", "objects", "moves", "repeat", "sequence", "channels", "optional")  # fmt: skip
-
-
 @SOME
 @given(table=st.dictionaries(st.sampled_from(KEYS), VALUES, max_size=5))
 def test_descriptions(table):
     for parse in (parse_rig, parse_task):
         one_line(parse, table)
-
-
-SETTINGS = st.sampled_from(sorted(OperatorSettings.model_fields))
-DOCUMENTS = st.one_of(
-    VALUES,
-    st.dictionaries(SETTINGS, VALUES, max_size=3),
-    st.fixed_dictionaries({"properties": st.fixed_dictionaries({"a": VALUES})}),
-)
 
 
 @SOME
@@ -281,15 +268,6 @@ def test_documents(folder, document):
     if blocks is not None:
         assert all(math.isfinite(v) and v > 0 for v in (blocks["a"].weight, blocks["a"].width))
     one_line(read_operator, path)
-
-
-LAB = example_folder()
-STREAM = (LAB / "trial_01.csv").read_bytes().splitlines()
-LINES = st.lists(
-    st.one_of(st.integers(1, 60).map(lambda k: STREAM[k]), st.binary(max_size=40),
-              st.tuples(st.integers(1, 60), st.integers(0, 12), CELLS)),
-    max_size=25,
-)  # fmt: skip
 
 
 @settings(SOME, max_examples=25)
@@ -333,10 +311,6 @@ def model(folder):
         return task, dict(file)
 
 
-ARRAYS = st.one_of(st.floats(), st.integers(-5, 5), st.text(max_size=4),
-                   st.lists(st.floats(), max_size=3), st.just(np.zeros((2, 0))))  # fmt: skip
-
-
 def check_model(folder, model, edits):
     task, table = model
     table = dict(table)
@@ -350,9 +324,6 @@ def check_model(folder, model, edits):
     path = folder / "edited.npz"
     np.savez(path, **table)
     one_line(load_model, path, task)
-
-
-EDITS = st.lists(st.tuples(st.integers(0, 40), st.one_of(st.none(), ARRAYS)), min_size=1, max_size=3)
 
 
 @SOME

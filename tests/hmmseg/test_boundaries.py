@@ -39,11 +39,9 @@ from hmmseg.segmentation.posteriors import contacts
 
 WIDTH = 0.05
 NODES = (np.arange(POINTS) + 0.5) / POINTS * WIDTH
-SOME = [
-    Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
-    Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "impact"),
-    Crossing(-2e-4, 1e-3, 0.01, 0.05, 3e-6, 3e-5, 2e-3, "launch"),
-]
+SOME = [Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
+        Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "impact"),
+        Crossing(-2e-4, 1e-3, 0.01, 0.05, 3e-6, 3e-5, 2e-3, "launch")]  # fmt: skip
 
 
 def linear(root, speed, kind, sd=1e-7):
@@ -106,8 +104,7 @@ def test_quantiles_and_moments_of_a_known_distribution():
     times = np.linspace(-5, 5, 4001)
     density = np.exp(-0.5 * times**2)
     posterior = BoundaryPosterior(1.0 + 0.1 * times, density / density.sum())
-    assert posterior.mean == pytest.approx(1.0)
-    assert posterior.sd == pytest.approx(0.1, rel=1e-4)
+    assert posterior.mean == pytest.approx(1.0) and posterior.sd == pytest.approx(0.1, rel=1e-4)
     for q, z in ((0.05, -1.6449), (0.5, 0.0), (0.95, 1.6449)):
         assert posterior.quantile(q) == pytest.approx(1.0 + 0.1 * z, abs=1e-4)
 
@@ -115,8 +112,7 @@ def test_quantiles_and_moments_of_a_known_distribution():
 def test_where_nothing_more_is_known_a_boundary_is_anywhere_in_its_interval():
     t = np.array([0.0, 0.1, 0.2, 0.35, 0.4])
     posterior = evenly(t, np.array([0.0, 0.25, 0.75, 1e-9]))
-    assert (np.diff(posterior.times) >= 0).all()
-    assert posterior.probabilities.sum() == pytest.approx(1.0)
+    assert (np.diff(posterior.times) >= 0).all() and posterior.probabilities.sum() == pytest.approx(1.0)
     early = posterior.times < 0.2
     assert posterior.probabilities[early].sum() == pytest.approx(0.25, abs=5e-3)
     assert posterior.mean == pytest.approx(0.25 * 0.15 + 0.75 * 0.275, abs=1e-4)
@@ -168,17 +164,14 @@ def touches(rng, width, num=1):
         noise = rng.normal(size=4)
         roots.append(root)
         # A sample interval before; drawn apart, so that what stands above is as it was.
-        phase_then, other = (
-            phase - width / duration,
-            np.random.default_rng(int(1e6 * root) + i).normal(size=3),
-        )
+        phase_then, other = (phase - width / duration,
+                             np.random.default_rng(int(1e6 * root) + i).normal(size=3))  # fmt: skip
         then = -distance * (_minimum_jerk(at_hit) - _minimum_jerk(phase_then)) + sd_left * other[0]
         v_then = (1 + SHAPE * other[1]) * distance * _minimum_jerk_slope(phase_then) / duration
-        crossings.append(Crossing(
-            left + sd_left * noise[0], right + sd_right * noise[1], v_left + sd_v * noise[2],
-            v * np.exp(-after / stop) + sd_v * noise[3], sd_left, sd_right, sd_v, "impact",
-            earlier=(width, then, v_then + sd_v * other[2]),
-        ))  # fmt: skip
+        crossings.append(Crossing(left + sd_left * noise[0], right + sd_right * noise[1],
+                                  v_left + sd_v * noise[2], v * np.exp(-after / stop) + sd_v * noise[3],
+                                  sd_left, sd_right, sd_v, "impact",
+                                  earlier=(width, then, v_then + sd_v * other[2])))  # fmt: skip
     return max(roots), crossings
 
 
@@ -315,10 +308,9 @@ def release(seed: int, slip: float | None = None) -> Change:
     rng = np.random.default_rng(seed)
     place = (5 - np.arange(12)) * 2e-4 + rng.uniform(0, 2e-4)
     pressed = np.where(np.arange(12) <= 5, np.maximum(place, 0), 0.0)
-    c = Penetration(
-        T, pressed + SD_PRESSED * rng.standard_normal(12), place + SD_PLACE * rng.standard_normal(12),
-        np.full((2, 12), -1e-2), SD_PRESSED, SD_PRESSED, SD_PLACE, 1e-3, 0.0,
-    )  # fmt: skip
+    c = Penetration(T, pressed + SD_PRESSED * rng.standard_normal(12),
+                    place + SD_PLACE * rng.standard_normal(12), np.full((2, 12), -1e-2), SD_PRESSED,
+                    SD_PRESSED, SD_PLACE, 1e-3, 0.0)  # fmt: skip
     probability = np.zeros(11)
     probability[5] = 1.0
     slips = () if slip is None else (slip,)
@@ -333,12 +325,10 @@ def test_a_grip_that_slides_before_it_ends_may_have_ended_then_and_another_ends_
     spent = float(np.interp(0.0, -place, T))
     found, plain = moment(change, known), moment(release(99), known)
     assert found.quantile(0.05) < slides + 2e-3 and found.quantile(0.95) > spent - 2e-3
-    assert plain.quantile(0.05) > slides + 10e-3
-    assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
+    assert plain.quantile(0.05) > slides + 10e-3 and abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
     for seed in range(90, 95):
         found, plain = moment(release(seed, slip=0.0), known), moment(release(seed), known)
-        assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 1e-3
-        assert found.sd < 1.5 * plain.sd
+        assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 1e-3 and found.sd < 1.5 * plain.sd
 
 
 def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():

@@ -56,8 +56,7 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(where, tmp_path, monke
     folder = cache_folder()
     assert folder is not None
     keep(folder / "one.json", b"1")
-    assert kept(folder / "one.json") is None
-    assert os.listdir(tmp_path) == ["a file"]
+    assert kept(folder / "one.json") is None and os.listdir(tmp_path) == ["a file"]
 
 
 PROGRAM = """
@@ -74,9 +73,8 @@ def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
 
     def run():
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True
-        )
+        done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True,
+                              text=True)  # fmt: skip
         assert done.stdout.endswith("30.0\n")
         return "cache_hits" in done.stdout, done.stderr
 
@@ -90,8 +88,7 @@ def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp
         content[len(content) // 2] ^= 0xFF
         program.write_bytes(content)
     hit, said = run()
-    assert programs and not hit and said.count("not as it was written") == 1
-    assert run() == (True, "")
+    assert programs and not hit and said.count("not as it was written") == 1 and run() == (True, "")
 
 
 FUNCTION = """
@@ -112,12 +109,10 @@ def test_functions_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
         done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True)
         return done.stdout.strip(), "not as it was written" in done.stderr
 
-    assert run() == ("3.0 0", False)
-    assert run() == ("3.0 1", False)
+    assert run() == ("3.0 0", False) and run() == ("3.0 1", False)
     for kind in "nbi", "nbc":
         (file,) = (tmp_path / "hmmseg/numba").rglob(f"*.{kind}")
         content = bytearray(file.read_bytes())
         content[len(content) // 2] ^= 0xFF
         file.write_bytes(content)
-        assert run() == ("3.0 0", True)
-        assert run() == ("3.0 1", False)
+        assert run() == ("3.0 0", True) and run() == ("3.0 1", False)

@@ -34,18 +34,15 @@ def names(segmentation) -> list[str]:
     return [f"{s.subtask} {s.object}" for s in segmentation.spans]
 
 
-REASONS = {
-    "drop_first": "block1 was let go in mid-air at ",
-    "drop_and_retry": " and gripped again at ",
-    "regrasp": "block1 was gripped again at ",
-    "regrasp_on_ground": "block1 was let go without being lifted at ",
-    "no_second_move": "no second grip: the recording ends in free motion",
-    "only_free_motion": "no grip: the recording ends in free motion",
-    "extra_move": "goes on after the task's end with another grip at ",
-    "starts_in_carry": "the recording starts while a block is held above the ground",
-    "stops_in_carry": "the recording ends while block2 is held above the ground",
-    "swapped": "block1 was raised by 16 mm from pickup to place, against the task",
-}
+REASONS = {"drop_first": "block1 was let go in mid-air at ", "drop_and_retry": " and gripped again at ",
+           "regrasp": "block1 was gripped again at ",
+           "regrasp_on_ground": "block1 was let go without being lifted at ",
+           "no_second_move": "no second grip: the recording ends in free motion",
+           "only_free_motion": "no grip: the recording ends in free motion",
+           "extra_move": "goes on after the task's end with another grip at ",
+           "starts_in_carry": "the recording starts while a block is held above the ground",
+           "stops_in_carry": "the recording ends while block2 is held above the ground",
+           "swapped": "block1 was raised by 16 mm from pickup to place, against the task"}  # fmt: skip
 
 
 @pytest.mark.parametrize("which", range(2))
@@ -53,8 +50,7 @@ REASONS = {
 def test_misfits_are_found_at_the_subtask_that_fails(edit, which):
     trial, expected = EDITS[edit](TRIALS[which], TRUTH[which])
     (found,) = segment(trial)
-    assert found.failed is not None
-    assert found.failed.index == expected
+    assert found.failed is not None and found.failed.index == expected
     document = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert document["complete"] is False
     assert (REASONS.get(edit, "") if which == 0 else "") in document["failed"]["reason"]
@@ -80,17 +76,15 @@ def test_poor_recordings_are_no_misfits_and_a_fall_in_them_is_told(world, number
 def test_what_is_good_before_and_after_a_drop_is_kept():
     aligned = aligned_of(EDITS["drop_first_go_on"](TRIALS[0], TRUTH[0])[0]).trials[0]
     kept = aligned.segmentation.spans
-    assert names(aligned.segmentation) == [
-        "pregrasp block1", "pickup block1", "carry block1",
-        "release block1", "pickup block2", "carry block2", "place block2", "release block2",
-    ]  # fmt: skip
+    assert names(aligned.segmentation) == ["pregrasp block1", "pickup block1", "carry block1",
+                                           "release block1", "pickup block2", "carry block2", "place block2",
+                                           "release block2"]  # fmt: skip
     starts = {f"{s.subtask} {s.object}": s.start for s in kept}
     for k, name in ((0, "pickup block1"), (1, "carry block1"), (4, "pickup block2"), (7, "release block2")):
         assert starts[name] == pytest.approx(TRUTH[0][k], abs=0.05)
     assert len(aligned.boundaries) == 8
     medians = [b.quantile(0.5) for b in aligned.boundaries]
-    assert np.all(np.diff(medians) >= 0)
-    assert medians[4] == pytest.approx(TRUTH[0][4], abs=0.05)
+    assert np.all(np.diff(medians) >= 0) and medians[4] == pytest.approx(TRUTH[0][4], abs=0.05)
 
 
 def test_a_bad_trial_does_not_touch_the_others():
@@ -107,8 +101,7 @@ def test_the_others_tell_which_block_is_which():
     b = TRUTH[0]
     twice = join(TRIALS[0], (-np.inf, b[3] + 0.5), (b[0] - 0.5, b[3] + 0.8))
     (*_, found) = segment(TRIALS[1], TRIALS[2], TRIALS[1], twice)
-    assert found.failed is not None
-    assert (found.failed.index, found.failed.object) == (5, "block2")
+    assert found.failed is not None and (found.failed.index, found.failed.object) == (5, "block2")
     assert "block1 was gripped again" in found.failed.reason
 
 
@@ -139,8 +132,7 @@ def test_a_touch_as_long_as_a_grip_is_one():
     b = TRUTH[0]
     tap = join(TRIALS[0], (-np.inf, b[0] + 0.1), (b[3], b[3] + 0.4), (b[0] - 0.4, np.inf))
     (found,) = segment(tap)
-    assert found.complete
-    assert found.spans[1].start == pytest.approx(b[0] + 0.9, abs=0.06)
+    assert found.complete and found.spans[1].start == pytest.approx(b[0] + 0.9, abs=0.06)
 
 
 @pytest.mark.parametrize("case, which", [("none_1", 1), ("grip_slip_1", 0)])
@@ -194,9 +186,8 @@ def flat(trial: Trial, value: float) -> Trial:
 def scattered(trial: Trial) -> Trial:
     """Forces missing but for two samples."""
     there = np.isin(np.arange(trial.t.size), (20, 60))
-    return Trial(
-        trial.file, trial.t, trial.channels | {n: np.where(there, trial.channels[n], np.nan) for n in FORCES}
-    )
+    return Trial(trial.file, trial.t, trial.channels | {n: np.where(there, trial.channels[n], np.nan)
+                                                        for n in FORCES})  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -209,8 +200,7 @@ def scattered(trial: Trial) -> Trial:
 )  # fmt: skip
 def test_hopeless_recordings_are_reported_not_raised(trial):
     aligned = aligned_of(trial).trials[0]
-    assert aligned.segmentation.failed is not None
-    assert len(aligned.boundaries) == 8
+    assert aligned.segmentation.failed is not None and len(aligned.boundaries) == 8
     json.dumps(aligned.segmentation.to_json(), allow_nan=False)
 
 

@@ -27,12 +27,20 @@ from hmmseg.segmentation.fit import (
     otsu,
 )
 
-STACK = BlockTask(
-    {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))
-)
+STACK = BlockTask({"block1": "block2", "block2": "ground"},
+                  (Move("block1", "ground"), Move("block2", "block1")))  # fmt: skip
 STEPS = subtasks(STACK)
 GRAVITY, COMPLIANCE, SQUEEZE = 9.81, 2e-4, 2.5e-4
 PADS = Pads(SQUEEZE, SQUEEZE, 2 * COMPLIANCE, 2 * COMPLIANCE)
+LEVELS = {1: 0.022, 3: 0.008, 5: 0.006, 7: 0.02}
+PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
+SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
+SPAN = {"vx": 0.4, "vy": 0.3, "y": 0.06, "d": 0.04, "force": 6.0, "press": 6.0}
+PARAMETERS = Parameters(bias=np.array([0.02, -0.01, 0.0, 0.03]), weight={"block": 0.4}, width={"block": 0.02},
+                        scale={"force": 0.01, "carry": 0.02, "net_x": 0.05, "shear": 0.05, "velocity": 0.003,
+                               "level": 1e-4, "width": 1e-4},
+                        levels=({1: 0.01, 2: 0.01, 3: 0.01},))  # fmt: skip
+STAY = 0.8
 
 
 @dataclass(frozen=True)
@@ -44,7 +52,6 @@ class Planted:
 
 
 PLANTED = Planted()
-LEVELS = {1: 0.022, 3: 0.008, 5: 0.006, 7: 0.02}
 
 
 def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
@@ -78,23 +85,10 @@ def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
         force[inside] += np.stack([grip, fy / 2, -grip, fy / 2], axis=1)
     spans = {"vx": np.ptp(vx), "vy": np.ptp(vy), "y": np.ptp(y), "d": np.ptp(d), "force": 6.0, "press": 6.0}
     noises = {"sd_y": 5e-5, "sd_d": 6e-5, "sd_vx": 2e-3, "sd_vy": 2e-3}
-    f = Features(
-        t=np.arange(num) * dt, force=force, vx=vx, vy=vy, ay=ay, y=y, d=d,
-        **{k: np.full(num, v) for k, v in noises.items()}, pads=PADS,
-        gravity=GRAVITY, span={k: float(v) for k, v in spans.items()},
-    )  # fmt: skip
+    f = Features(t=np.arange(num) * dt, force=force, vx=vx, vy=vy, ay=ay, y=y, d=d,
+                 **{k: np.full(num, v) for k, v in noises.items()}, pads=PADS, gravity=GRAVITY,
+                 span={k: float(v) for k, v in spans.items()})  # fmt: skip
     return f, labels
-
-
-PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
-SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
-SPAN = {"vx": 0.4, "vy": 0.3, "y": 0.06, "d": 0.04, "force": 6.0, "press": 6.0}
-PARAMETERS = Parameters(
-    bias=np.array([0.02, -0.01, 0.0, 0.03]), weight={"block": 0.4}, width={"block": 0.02},
-    scale={"force": 0.01, "carry": 0.02, "net_x": 0.05, "shear": 0.05, "velocity": 0.003,
-           "level": 1e-4, "width": 1e-4},
-    levels=({1: 0.01, 2: 0.01, 3: 0.01},),
-)  # fmt: skip
 
 
 def test_edges_are_students_distribution_far_into_their_tails():
@@ -137,9 +131,8 @@ def test_ungripped_force_density_integrates_to_one():
     box = -np.log(8.0 * 14.0)
     one = np.where((x[:, 0] > -1) & (x[:, 0] < 7) & (np.abs(x[:, 1]) < 7), box, -np.inf)
     two = np.where((x[:, 2] < 1) & (x[:, 2] > -7) & (np.abs(x[:, 3]) < 7), box, -np.inf)
-    proposal = np.logaddexp.reduce(
-        [quiet.sum(axis=1), one + quiet[:, 2:].sum(axis=1), quiet[:, :2].sum(axis=1) + two]
-    ) - np.log(3)
+    proposal = np.logaddexp.reduce([quiet.sum(axis=1), one + quiet[:, 2:].sum(axis=1),
+                                    quiet[:, :2].sum(axis=1) + two]) - np.log(3)  # fmt: skip
     ratio = np.exp(_log_ungripped(x, scale, span, 0.0) - proposal)
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(num) + 1e-3
 
@@ -217,9 +210,8 @@ def test_what_strays_on_its_support_stays_near_it():
 def test_otsu_against_trying_every_split():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        values = np.concatenate(
-            [rng.normal(0, 1, rng.integers(3, 30)), rng.normal(6, 2, rng.integers(3, 30))]
-        )
+        values = np.concatenate([rng.normal(0, 1, rng.integers(3, 30)),
+                                 rng.normal(6, 2, rng.integers(3, 30))])  # fmt: skip
         v = np.sort(values)
 
         def between(i, v=v):
@@ -309,9 +301,6 @@ def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():
     assert found[3] > 0
 
 
-STAY = 0.8
-
-
 def learn_level(trials, start, **settings):
     """EM of two unit-variance levels, the first known to be 0."""
     chain = Chain(np.log([STAY, 1.0]), np.log([1 - STAY]))
@@ -340,10 +329,8 @@ def by_enumeration(trials, level):
 
 def recorded():
     rng = np.random.default_rng(0)
-    return tuple(
-        np.r_[rng.normal(size=before), rng.normal(2.0, 1.0, size=after)]
-        for before, after in ((3, 6), (4, 5), (6, 3), (2, 3))
-    )
+    return tuple(np.r_[rng.normal(size=before), rng.normal(2.0, 1.0, size=after)]
+                 for before, after in ((3, 6), (4, 5), (6, 3), (2, 3)))  # fmt: skip
 
 
 def test_em_ends_at_the_maximum_of_the_evidence():

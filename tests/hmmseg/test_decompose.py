@@ -21,9 +21,8 @@ from hmmseg.contact.decompose import (
 from hmmseg.io.task import GROUND, BlockTask, Move
 
 PAPER = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
-TOWER = BlockTask(
-    {"a": "b", "b": "c", "c": GROUND}, (Move("a", GROUND), Move("b", GROUND), Move("c", "b"), Move("a", "c"))
-)
+TOWER = BlockTask({"a": "b", "b": "c", "c": GROUND},
+                  (Move("a", GROUND), Move("b", GROUND), Move("c", "b"), Move("a", "c")))  # fmt: skip
 SLIDE = BlockTask({"a": GROUND}, (Move("a", GROUND, slide=True),))
 
 
@@ -43,8 +42,7 @@ def test_the_papers_states():
     assert [s.support for s in found] == [None, "block2", None, GROUND, None, GROUND, None, "block1", None]
     assert [s.move for s in found] == [0, 0, 0, 0, 0, 1, 1, 1, 1]
     assert found[1].constraints == ("block1-block2", "finger1-block1", "finger2-block1")
-    assert found[2].constraints == ("finger1-block1", "finger2-block1")
-    assert found[4].constraints == ()
+    assert found[2].constraints == ("finger1-block1", "finger2-block1") and found[4].constraints == ()
 
 
 def test_the_papers_table_1_names_its_signals():
@@ -60,8 +58,7 @@ def test_the_papers_table_1_names_its_signals():
 
 def test_physics_gives_width_on_the_ground_and_weight_only_above_it():
     found = decompose(PAPER)
-    assert ways(found, "block1", "width") == [(1,), (2,), (3,)]
-    assert ways(found, "block1", "weight") == [(2,)]
+    assert ways(found, "block1", "width") == [(1,), (2,), (3,)] and ways(found, "block1", "weight") == [(2,)]
     assert ways(found, "block1", "friction") == [(1,), (2,), (3,)]
     assert {name: entry.kind for name, entry in found.properties["block1"].items()} == {
         "weight": "value", "width": "value", "height": "value", "friction": "bound",
@@ -72,8 +69,7 @@ def test_physics_gives_width_on_the_ground_and_weight_only_above_it():
 def test_tower_heights_take_several_moves():
     found = decompose(TOWER)
     rises = [{"b": -1, "c": -1}, {"c": -1}, {"b": 1}, {"b": 1, "c": 1}]
-    assert height_equations(TOWER) == list(enumerate(rises))
-    assert ways(found, "c", "height") == [(5, 7)]
+    assert height_equations(TOWER) == list(enumerate(rises)) and ways(found, "c", "height") == [(5, 7)]
     assert ways(found, "b", "height") == [(9, 11)]
     short = decompose(BlockTask(TOWER.initial, TOWER.moves[:2]))
     assert ways(short, "b", "height") == [(1, 3, 5, 7)]  # b + c from the first move, c from the second
@@ -83,11 +79,9 @@ def test_tower_heights_take_several_moves():
 def test_heights_known_only_together():
     found = decompose(BlockTask(TOWER.initial, TOWER.moves[:1]))
     reasons = {name: entries["height"].reason for name, entries in found.properties.items()}
-    assert reasons == {
-        "a": "no recorded move changes the height at which something rests by a's height",
-        "b": "move 1 changes heights by b's only together with the height of c",
-        "c": "move 1 changes heights by c's only together with the height of b",
-    }
+    assert reasons == {"a": "no recorded move changes the height at which something rests by a's height",
+                       "b": "move 1 changes heights by b's only together with the height of c",
+                       "c": "move 1 changes heights by c's only together with the height of b"}  # fmt: skip
     for name in ("weight", "width", "friction"):
         assert found.properties["b"][name].reason == "no recorded move grips b"
 
@@ -221,12 +215,8 @@ def test_balance_agrees_with_the_jacobian_of_a_forward_model():
     carry = subtasks(PAPER)[1:4]
     sliding = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", "block2", slide=True),))
     slide = subtasks(sliding)[1:4]
-    names = [
-        ("weight", "block1"),
-        ("width", "block1"),
-        ("height", "block2"),
-        ("friction_on_block2", "block1"),
-    ]
+    names = [("weight", "block1"), ("width", "block1"), ("height", "block2"),
+             ("friction_on_block2", "block1")]  # fmt: skip
     forward = {id(carry): [(on_support, 1), (lifted, 0), (on_support, 0)],
                id(slide): [(on_support, 1), (slipping, 1), (on_support, 1)]}  # fmt: skip
     for steps in (carry, slide):
@@ -254,5 +244,4 @@ def test_elimination_agrees_with_numerical_null_space(rows):
 
 def test_known_unknowns_are_given():
     both = {("weight", "a"): Fraction(1), ("load",): Fraction(-1), Source(0, "f"): Fraction(-1)}
-    assert determined([both]) == {}
-    assert set(determined([both], known=[("weight", "a")])) == {("load",)}
+    assert determined([both]) == {} and set(determined([both], known=[("weight", "a")])) == {("load",)}

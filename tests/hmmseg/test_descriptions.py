@@ -10,15 +10,15 @@ from hmmseg.io.task import BlockTask, Move, SequenceTask, parse_task, read_task
 
 FINGER = {"base": [0.05, 0.17], "links": [0.12, 0.12]}
 HAND = {"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.21, 0.17]}}}
+STACK = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
+SWAP = [{"object": "block1", "to": "ground"}, {"object": "block2", "to": "block1"}]
+BACK = [{"object": "a", "to": "b"}, {"object": "a", "to": "ground"}]
 
 
 def test_what_is_left_out_has_its_default():
     rig = parse_rig({})
-    assert rig == Rig()
-    assert not rig.jointed
-    assert rig.gravity == 9.80665
-    assert math.isinf(rig.fingertip.normal_stiffness)
-    assert rig.noise.force is None
+    assert rig == Rig() and not rig.jointed and rig.gravity == 9.80665
+    assert math.isinf(rig.fingertip.normal_stiffness) and rig.noise.force is None
     with pytest.raises(ValueError, match="a Cartesian hand has no fingers"):
         rig.finger(1)
 
@@ -26,11 +26,9 @@ def test_what_is_left_out_has_its_default():
 def test_systematic_uncertainty_by_number_list_or_name():
     rig = parse_rig({"systematic": {"force_bias": 0.01, "force_gain": [0.1, 0.2, 0.3, 0.4],
                                     "joint_offset": {"q12": 0.002}, "pad_stiffness": 1}})  # fmt: skip
-    assert rig.systematic.force_bias == (0.01,) * 4
-    assert rig.systematic.force_gain == (0.1, 0.2, 0.3, 0.4)
+    assert rig.systematic.force_bias == (0.01,) * 4 and rig.systematic.force_gain == (0.1, 0.2, 0.3, 0.4)
     assert rig.systematic.joint_offset == (0.0, 0.002, 0.0, 0.0)
-    assert rig.systematic.pad_stiffness == (1.0, 1.0)
-    assert rig.systematic.link_length == (0.0,) * 4
+    assert rig.systematic.pad_stiffness == (1.0, 1.0) and rig.systematic.link_length == (0.0,) * 4
 
 
 def test_gripper_and_tolerance():
@@ -109,34 +107,23 @@ def test_refused_with_its_message(table, message):
     assert "\n" not in str(caught.value)
 
 
-STACK = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
-SWAP = [{"object": "block1", "to": "ground"}, {"object": "block2", "to": "block1"}]
-BACK = [{"object": "a", "to": "b"}, {"object": "a", "to": "ground"}]
-
-
 def test_reads_blocks_and_moves(tmp_path):
     path = tmp_path / "task.toml"
-    path.write_text(
-        '[objects.block1]\non = "block2"\n[objects.block2]\non = "ground"\n'
-        '[[moves]]\nobject = "block1"\nto = "ground"\n'
-        '[[moves]]\nobject = "block1"\nto = "ground"\nslide = true\n'
-    )
+    path.write_text('[objects.block1]\non = "block2"\n[objects.block2]\non = "ground"\n'
+                    '[[moves]]\nobject = "block1"\nto = "ground"\n'
+                    '[[moves]]\nobject = "block1"\nto = "ground"\nslide = true\n')  # fmt: skip
     task = read_task(path)
-    assert task == BlockTask(
-        {"block1": "block2", "block2": "ground"},
-        (Move("block1", "ground"), Move("block1", "ground", slide=True)),
-    )
+    assert task == BlockTask({"block1": "block2", "block2": "ground"},
+                             (Move("block1", "ground"), Move("block1", "ground", slide=True)))  # fmt: skip
     assert task.objects == ("block1", "block2")
 
 
 def test_repeat_writes_the_moves_out():
     table = {"objects": {"a": {"on": "ground"}, "b": {"on": "ground"}}, "moves": BACK, "repeat": 3}
     task = parse_task(table)
-    assert isinstance(task, BlockTask)
-    assert task.performed == task.moves * 3
+    assert isinstance(task, BlockTask) and task.performed == task.moves * 3
     unknown = parse_task({**table, "repeat": "unknown"})
-    assert isinstance(unknown, BlockTask)
-    assert unknown.performed == unknown.moves
+    assert isinstance(unknown, BlockTask) and unknown.performed == unknown.moves
 
 
 def test_reads_a_plain_sequence():
@@ -153,7 +140,7 @@ def move(**entry):
     return blocks(moves=[entry])
 
 
-TASKS_REFUSED = [
+@pytest.mark.parametrize(("table", "message"), [
     (blocks(move=[]), "task: key move: unknown key; expected one of channels, moves, objects, optional, "
      r"repeat, sequence \(did you mean moves\?\)"),
     (blocks(sequence=["a"]), "task: key moves: does not go with `sequence`"),
@@ -210,10 +197,7 @@ TASKS_REFUSED = [
     ({"sequence": ["a"], "channels": ["f", "f"]}, "task: key channels: empty or repeated; expected distinct"),
     ({"sequence": ["a", "b"], "optional": ["c"]}, "task: key optional: 'c' is not in sequence; .* a, b"),
     ({"sequence": ["a", "b"], "optional": ["a", "b"]}, "task: key optional: covers all of sequence"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("table", "message"), TASKS_REFUSED)
+])  # fmt: skip
 def test_a_task_refused_with_its_message(table, message):
     with pytest.raises(InputError, match=f"^{message}") as caught:
         parse_task(table)
@@ -226,11 +210,8 @@ def test_a_file_that_is_absent_or_malformed(read, tmp_path):
     assert read_task(tmp_path / "marked.toml").sequence == ("a", "b")
     (tmp_path / "bad.toml").write_text("moves = [")
     (tmp_path / "latin.toml").write_bytes(b'sequence = ["\xe9"]')
-    for name, line in (
-        ("absent.toml", r"absent\.toml: no such file; expected a TOML file"),
-        ("bad.toml", r"bad\.toml: not valid TOML: "),
-        ("latin.toml", r"latin\.toml: cannot be read"),
-        (".", "cannot be read"),
-    ):
+    for name, line in (("absent.toml", r"absent\.toml: no such file; expected a TOML file"),
+                       ("bad.toml", r"bad\.toml: not valid TOML: "),
+                       ("latin.toml", r"latin\.toml: cannot be read"), (".", "cannot be read")):  # fmt: skip
         with pytest.raises(InputError, match=line):
             read(tmp_path / name)

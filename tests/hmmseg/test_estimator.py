@@ -11,6 +11,10 @@ from sklearn.utils.estimator_checks import check_estimator
 from hmmseg import segment
 from hmmseg.sequence.estimator import OrderedSegmenter
 
+EXPECTED = {"check_clustering": "rows are samples in time, not points to be clustered in any order",
+            "check_methods_sample_order_invariance": "the order of the samples is what is modelled",
+            "check_methods_subset_invariance": "a stretch of a sequence is another sequence"}  # fmt: skip
+
 
 def steps(seed, edges=(60, 140), length=200):
     rng = np.random.default_rng(seed)
@@ -44,13 +48,6 @@ def test_abrupt_changes_are_dated_where_they_jump_and_short_states_are_there():
     y = np.array([0, 0.3, 0.2, 0.1, 10, 11, 12, 13])
     spans = segment({"t": np.arange(8.0), "y": y}, {"sequence": ["low", "high"]})[0].spans
     assert spans[1].start == 3.5 and spans[1].start_90[0] <= 3.5 <= spans[1].start_90[1]
-
-
-EXPECTED = {
-    "check_clustering": "rows are samples in time, not points to be clustered in any order",
-    "check_methods_sample_order_invariance": "the order of the samples is what is modelled",
-    "check_methods_subset_invariance": "a stretch of a sequence is another sequence",
-}
 
 
 def test_scikit_learns_own_checks():

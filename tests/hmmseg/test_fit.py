@@ -54,20 +54,17 @@ def test_planted_boundaries_are_recovered_without_labels():
         assert result.complete, result.failed
         assert [span.subtask for span in result.spans] == list(TASK.sequence)
         np.testing.assert_allclose(found(result), boundaries, atol=0.08)
-        assert result.spans[0].start == trial.t[0]
-        assert result.spans[-1].end == trial.t[-1]
+        assert result.spans[0].start == trial.t[0] and result.spans[-1].end == trial.t[-1]
         for one, two in zip(result.spans, result.spans[1:], strict=False):
-            assert one.end == two.start
-            assert one.end_90[0] <= one.end <= one.end_90[1]
+            assert one.end == two.start and one.end_90[0] <= one.end <= one.end_90[1]
 
 
 def test_labels_teach_their_lag():
     # The channels change 0.2 s after the labels: only a labelled model can know.
     data = recordings(3, start=40, lag=0.2)
     lagged = taught(lag=0.2)
-    for result, (_, boundaries) in zip(
-        segment_sequence([t for t, _ in data], TASK, lagged), data, strict=True
-    ):
+    for result, (_, boundaries) in zip(segment_sequence([t for t, _ in data], TASK, lagged), data,
+                                       strict=True):  # fmt: skip
         np.testing.assert_allclose(found(result), boundaries, atol=0.06)
 
 
@@ -99,10 +96,8 @@ def test_intervals_cover_planted_boundaries(correlation):
     for group in range(6):
         data = [record(1000 + 10 * group + i, correlation=correlation) for i in range(5)]
         for result, (_, boundaries) in zip(segment_sequence([t for t, _ in data], TASK), data, strict=True):
-            hits += [
-                low <= b <= high
-                for (low, high), b in zip([s.start_90 for s in result.spans[1:]], boundaries, strict=True)
-            ]
+            hits += [low <= b <= high for (low, high), b in zip([s.start_90 for s in result.spans[1:]],
+                                                                boundaries, strict=True)]  # fmt: skip
     assert np.mean(hits) >= 0.85, np.mean(hits)
 
 
@@ -126,8 +121,7 @@ def test_optional_subtasks_may_be_absent():
     model = fit_sequence([t for t, _ in data], task, labels)
     tests = [record(90, sequence=kinds[1]), record(91)]
     without, with_it = segment_sequence([t for t, _ in tests], task, model)
-    assert [span.subtask for span in without.spans] == ["wait", "push", "pull"]
-    assert without.complete
+    assert [span.subtask for span in without.spans] == ["wait", "push", "pull"] and without.complete
     np.testing.assert_allclose(found(without), tests[0][1], atol=0.06)
     assert [span.subtask for span in with_it.spans] == list(TASK.sequence)
     np.testing.assert_allclose(found(with_it), tests[1][1], atol=0.06)
@@ -138,9 +132,8 @@ def test_a_state_that_comes_twice_is_one():
     data = [record(120 + i, sequence=task.sequence) for i in range(3)]
     model = fit_sequence([t for t, _ in data], task)
     np.testing.assert_array_equal(model.emissions.loc[0], model.emissions.loc[2])
-    for result, (_, boundaries) in zip(
-        segment_sequence([t for t, _ in data], task, model), data, strict=True
-    ):
+    for result, (_, boundaries) in zip(segment_sequence([t for t, _ in data], task, model), data,
+                                       strict=True):  # fmt: skip
         np.testing.assert_allclose(found(result), boundaries, atol=0.06)
 
 
@@ -226,11 +219,9 @@ def test_labels_in_order_or_from_files_are_those_by_name(tmp_path):
     starts = {n: dict(zip(TASK.sequence[1:], truth[n], strict=True)) for n in (0, 2)}
     rows = [(f"trial_{n}", name, at) for n, mine in starts.items() for name, at in mine.items()]
     lines = [("trial", "subtask", "start"), *[(a, b, repr(c)) for a, b, c in rows]]
-    for name, text in {
-        "comma.csv": "\ufeff# ours\n" + "".join(",".join(line) + "\n" for line in lines),
-        "semicolon.csv": "".join(";".join(line).replace(".", ",") + "\n" for line in lines),
-        "tab.tsv": "".join("\t".join(line) + "\n" for line in lines),
-    }.items():
+    for name, text in {"comma.csv": "\ufeff# ours\n" + "".join(",".join(line) + "\n" for line in lines),
+                       "semicolon.csv": "".join(";".join(line).replace(".", ",") + "\n" for line in lines),
+                       "tab.tsv": "".join("\t".join(line) + "\n" for line in lines)}.items():  # fmt: skip
         (tmp_path / name).write_text(text, encoding="utf-8")
         np.testing.assert_array_equal(read_labels(trials, TASK, tmp_path / name), expected)
     for n in (0, 2):

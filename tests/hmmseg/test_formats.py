@@ -46,11 +46,11 @@ TOPICS = parse_rig({"topics": {
     "height": "/pose.pose.position.z",
 }})  # fmt: skip
 LOGGED = SequenceTask(("a", "b"), channels=("push", "angle", "height"))
-LOGS = {
-    "mcap": lambda folder: write_mcap(folder / "log.mcap"),
-    "ROS 1 bag": lambda folder: write_bag(folder / "log.bag"),
-    "ROS 2 bag": lambda folder: write_bag(folder / "log"),
-}
+LOGS = {"mcap": lambda folder: write_mcap(folder / "log.mcap"),
+        "ROS 1 bag": lambda folder: write_bag(folder / "log.bag"),
+        "ROS 2 bag": lambda folder: write_bag(folder / "log")}  # fmt: skip
+NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
+HAND = ["--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"), "--method", "qualitative"]
 
 
 @pytest.mark.parametrize("kind", LOGS)
@@ -68,9 +68,8 @@ def test_logs_are_joined_on_the_fastest_wanted_clock(tmp_path, kind):
 
 
 def test_without_a_stamp_everywhere_times_of_logging_are_taken(tmp_path):
-    rig = parse_rig(
-        {"topics": {"f": "/wrench.wrench.force.x", "w": "/opening.data", "z": "/pose.pose.position.z"}}
-    )
+    rig = parse_rig({"topics": {"f": "/wrench.wrench.force.x", "w": "/opening.data",
+                                "z": "/pose.pose.position.z"}})  # fmt: skip
     trial = read_trial(write_mcap(tmp_path / "a.mcap"), rig, SequenceTask(("a",), channels=("f", "w", "z")))
     assert trial.origin == START + 300_000
     np.testing.assert_allclose(trial.channels["w"], 0.06)
@@ -141,9 +140,8 @@ def test_a_bag_without_its_metadata(tmp_path):
 
 def test_columns_of_other_lengths_are_read_apart(tmp_path):
     steps = np.arange(50.0)
-    path = robomimic_of(
-        tmp_path / "a.hdf5", 20, [{"states": np.stack([steps, -steps], 1), "actions": steps[1:]}]
-    )
+    path = robomimic_of(tmp_path / "a.hdf5", 20,
+                        [{"states": np.stack([steps, -steps], 1), "actions": steps[1:]}])  # fmt: skip
     for name, count in (("actions", 49), ("states[1]", 50)):
         trial = read_trial(path, task=SequenceTask(("a",), channels=(name,)))
         np.testing.assert_allclose(trial.t, np.arange(count) / 20)
@@ -259,19 +257,12 @@ def test_a_topic_that_is_not_there(tmp_path):
         read_trial(write_mcap(tmp_path / "a.mcap"), rig, SequenceTask(("a",), channels=("f",)))
 
 
-NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
-HAND = ["--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"), "--method", "qualitative"]
-
-
 def span(name, start, end, start_sd=0.0, end_sd=0.0, obj=None):
     return Span(name, obj, name, start, end, start_sd, end_sd, (start, start), (end, end))
 
 
-SPANS = (
-    span("reach", 0.0, 0.25, 0.0, 0.01),
-    span("push", 0.25, 0.4, 0.01, 0.03),
-    span("leave", 0.4, 0.6, 0.03),
-)
+SPANS = span("reach", 0.0, 0.25, 0.0, 0.01), span("push", 0.25, 0.4, 0.01,
+                                                  0.03), span("leave", 0.4, 0.6, 0.03)  # fmt: skip
 
 
 def test_labels_by_hand():
@@ -341,9 +332,8 @@ def test_a_lerobot_data_set_with_subtasks(tmp_path, version):
             said | {"content": s.subtask, "timestamp": pytest.approx(s.start)} for s in SPANS
         ]
     held = read_table(f"{tmp_path}/new#1").columns["language.subtask"].tolist()
-    expected = [
-        "reach" if t < 0.25 else "push" if t < 0.4 else "leave" for t in [row["timestamp"] for row in one]
-    ]
+    expected = ["reach" if t < 0.25 else "push" if t < 0.4 else "leave"
+                for t in [row["timestamp"] for row in one]]  # fmt: skip
     assert held == expected
     again = read_trial(f"{tmp_path}/new#1", rig, SequenceTask(("a",), channels=("action.b",)))
     np.testing.assert_array_equal(again.channels["action.b"], 1.0)
@@ -366,8 +356,7 @@ def test_destinations_refused_before_the_work(tmp_path, monkeypatch, capsys, wri
     before = sorted(os.listdir())
     names = [f"trial_{k:02d}.csv" for k in range(1, trials + 1)]
     assert main(["segment", *names, *HAND, "--write", write]) == 2
-    assert re.search(line, capsys.readouterr().err)
-    assert sorted(os.listdir()) == before
+    assert re.search(line, capsys.readouterr().err) and sorted(os.listdir()) == before
 
 
 def test_labels_are_not_written_twice(tmp_path, capsys):

@@ -192,9 +192,8 @@ def test_optional_states_may_be_passed_over():
     )
     # Without evidence, a recording of any length visits the states as often as was said.
     flat = hmm.smooth(np.zeros((400, 4)), chain)
-    visits = flat.smoothed[0] + np.array(
-        [sum(m[:, k - d].sum() for d, m in enumerate(flat.moves, 1) if k >= d) for k in range(4)]
-    )
+    visits = flat.smoothed[0] + np.array([sum(m[:, k - d].sum() for d, m in enumerate(flat.moves, 1)
+                                              if k >= d) for k in range(4)])  # fmt: skip
     np.testing.assert_allclose(visits, presence, atol=1e-9)
 
 
@@ -236,9 +235,8 @@ def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
     for table, subtask, reason in [(starved, 1, "no sample is possible under it"),
                                    (dead_end, 2, "cannot be held to the end")]:  # fmt: skip
         with pytest.raises(hmm.InfeasibleAlignment, match=reason) as caught:
-            getattr(hmm, function)(
-                table, chain_of(bands), *{"k_best": (3,), "sample": (3,)}.get(function, ())
-            )
+            getattr(hmm, function)(table, chain_of(bands),
+                                   *{"k_best": (3,), "sample": (3,)}.get(function, ()))  # fmt: skip
         assert caught.value.subtask == subtask
 
 
@@ -265,9 +263,8 @@ def test_jit_and_vmap_over_ragged_recordings_equal_one_by_one(bits):
     for i, n in enumerate(lengths):
         alone, posterior = hmm.viterbi(ll[i, :n], chain), hmm.smooth(ll[i, :n], chain)
         assert best.starts[i].tolist() == alone.starts.tolist()
-        np.testing.assert_allclose(
-            soft.smoothed[i, :n], posterior.smoothed, atol=1e-6 if bits == 32 else 1e-12
-        )
+        np.testing.assert_allclose(soft.smoothed[i, :n], posterior.smoothed, atol=1e-6 if bits == 32
+                                   else 1e-12)  # fmt: skip
         assert (soft.smoothed[i, n:] == 0).all() and (soft.moves[0][i, n - 1 :] == 0).all()
 
 
@@ -332,11 +329,8 @@ def test_in_single_precision_a_long_recording_keeps_its_labels_inside_jit():
 
 def unordered(num_timesteps, num_states, seed=0):
     rng = np.random.default_rng(seed)
-    return (
-        rng.normal(size=(num_timesteps, num_states)),
-        rng.normal(size=num_states),
-        rng.normal(size=(num_states, num_states)),
-    )
+    return (rng.normal(size=(num_timesteps, num_states)), rng.normal(size=num_states),
+            rng.normal(size=(num_states, num_states)))  # fmt: skip
 
 
 def every_path(ll, initial, transition):

@@ -55,12 +55,9 @@ def problem(num_rows, num_states, seed):
     return 2 * rng.normal(size=(num_rows, num_states)), durations
 
 
-CASES = [(1, 1), (6, 2), (8, 3), (7, 4)]
-
-
 @pytest.mark.parametrize("open_end", [False, True])
 @pytest.mark.parametrize("optional", [False, True])
-@pytest.mark.parametrize("size", CASES)
+@pytest.mark.parametrize("size", [(1, 1), (6, 2), (8, 3), (7, 4)])
 def test_every_quantity_matches_enumeration(size, optional, open_end):
     for seed in range(20):  # the first random tables that allow any path
         ll, durations = problem(*size, seed=sum(size) + 100 * seed)

@@ -41,8 +41,7 @@ def squeeze(step=0.02, compliance=2.5e-4):
 def test_the_slope_of_a_squeeze_is_the_compliance():
     load, value = reading(squeeze())
     slope, information = fit_slope(load, value, 2e-5)
-    assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5)
-    assert np.std(value + slope * load) < 4e-5
+    assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5) and np.std(value + slope * load) < 4e-5
     assert fit_slope(load[:3], value[:3], 2e-5) == fit_slope(0 * load, value, 2e-5) == (0.0, 0.0)
 
 
@@ -99,8 +98,7 @@ def test_recorded_lag_is_found_and_said():
 
 def test_healthy_forces_are_neither_late_nor_filtered():
     found, residual = world()
-    assert found.remarks == ()
-    assert np.median(np.abs(residual)) < 0.004
+    assert found.remarks == () and np.median(np.abs(residual)) < 0.004
 
 
 def test_reading_again_undoes_what_was_found():
@@ -108,9 +106,8 @@ def test_reading_again_undoes_what_was_found():
     ramp = np.clip(t - 0.3, 0, 0.4)
     zero = np.zeros(t.size)
     late = np.interp(t - 0.05, t, ramp)
-    known = dict.fromkeys(
-        ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2"), late
-    )
+    known = dict.fromkeys(("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2"),
+                          late)  # fmt: skip
     signals = Signals(t, **known, sd_x=zero, sd_y=zero, sd_vx=zero, sd_vy=zero, sd_force=0.01)
     pad = Compliance(2.5e-4, 1e-6, 0.05)
     again = read_again(signals, Sensing(pad, pad, 0.05, 0.001, late=True))
@@ -138,8 +135,7 @@ def test_friction_is_the_steepest_ratio_that_a_contact_shows_for_sure():
                       **dict.fromkeys(still, np.zeros_like(t)))  # fmt: skip
     parameters = Parameters(np.zeros(4), {"a": 1.0}, {"force": 0.01})
     one, two = steepest(signals, 0.0, 0.8, parameters)
-    assert one == pytest.approx(0.8, abs=0.06) and one < 0.8
-    assert two == pytest.approx(0.4, abs=0.06)
+    assert one == pytest.approx(0.8, abs=0.06) and one < 0.8 and two == pytest.approx(0.4, abs=0.06)
     assert steepest(signals, 0.9, 1.0, parameters) == []
 
 
@@ -169,15 +165,13 @@ def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE
 @pytest.mark.parametrize("delay", [0.03, 0.06, 0.2])
 def test_a_delay_is_found(delay, step):
     found = lateness([whole_grip(delay, step=step, seed=i) for i in range(4)], PRIOR)
-    assert found.late and not found.filter
-    assert found.delay == pytest.approx(delay, abs=0.006)
+    assert found.late and not found.filter and found.delay == pytest.approx(delay, abs=0.006)
 
 
 @pytest.mark.parametrize("constant", [0.03, 0.06])
 def test_a_filter_is_found_and_told_from_a_delay(constant):
     found = lateness([whole_grip(constant=constant, seed=i) for i in range(4)], PRIOR)
-    assert found.late and found.filter
-    assert found.delay == pytest.approx(constant, rel=0.2)
+    assert found.late and found.filter and found.delay == pytest.approx(constant, rel=0.2)
 
 
 def test_pads_softer_than_stated_are_no_delay():
@@ -224,8 +218,7 @@ def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
     filtered = np.interp(t, fine, lfilter([1 - kept], [1, -kept], force))
     undone, louder = _unfiltered(t, filtered, 0.03)
     np.testing.assert_allclose(undone, np.interp(t, fine, force), atol=0.15)
-    assert louder == pytest.approx(np.sqrt(5))
-    assert np.abs(undone[t < 0.31]).max() < 0.02
+    assert louder == pytest.approx(np.sqrt(5)) and np.abs(undone[t < 0.31]).max() < 0.02
 
 
 @pytest.mark.parametrize("step", [0.05, 0.01, 0.002])

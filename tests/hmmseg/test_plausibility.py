@@ -19,6 +19,11 @@ from hmmseg.io.rig import parse_rig, read_rig
 from hmmseg.robust import coarse_step
 from hmmseg.segmentation.emissions import noise_sd
 
+DEG = 180 / np.pi
+GF, KGF = 9.80665e-3, 9.80665
+FORCES = ("fx1", "fy1", "fx2", "fy2")
+PLAIN, SWAYING = Setup(), Setup(heading=0.9, tilt=0.1, offset=(1.0, 2.0, 3.0), reaction=True)
+
 
 def changed(table, **factors):
     """The table with each named column (or all that begin so) times a factor."""
@@ -35,7 +40,6 @@ def swapped(table):
             for name, values in table.items()}  # fmt: skip
 
 
-DEG = 180 / np.pi
 LOW = changed(CARTESIAN, y=0.5, vy=0.5)
 MISFITS = {
     "t in ms, rate known": (JOINT, changed(JOINT, t=1e3), JOINTED, r"column t: .*rate = 20 .*looks like ms"),
@@ -94,9 +98,8 @@ def test_seconds_since_1970_are_kept_and_told():
 def test_the_hands_own_weight_is_told():
     table = {**JOINT, "fy1": JOINT["fy1"] - 2.5, "fy2": JOINT["fy2"] - 2.5}
     (line,) = read_trial(table, JOINTED).warnings
-    assert re.search(
-        r"column fy1 and fy2 sum to -5\S* N before the first touch, a lift adds .* gravity or", line
-    )
+    assert re.search(r"column fy1 and fy2 sum to -5\S* N before the first touch, a lift adds .* gravity or",
+                     line)  # fmt: skip
     again = read_trial(table, mended(JOINTED, line))
     assert again.warnings == ()
     np.testing.assert_allclose(again.channels["fy1"], JOINT["fy1"], atol=0.05)
@@ -158,18 +161,16 @@ def test_a_position_stuck_for_most_of_a_recording_is_not_taken_for_coarse_steps(
     assert not any("in steps of" in line for line in trial.warnings)
 
 
-@pytest.mark.parametrize(
-    ("names", "line"), [({"x2", "y2", "vx2", "vy2", "fx2", "fy2"}, "as all of finger 2"), (set(), "")]
-)
+@pytest.mark.parametrize(("names", "line"), [({"x2", "y2", "vx2", "vy2", "fx2", "fy2"}, "as all of finger 2"),
+                                             (set(), "")])  # fmt: skip
 def test_hands_of_other_than_two_fingers_are_told(names, line):
     table = {k: v for k, v in CARTESIAN.items() if k not in names} | {"fx3": CARTESIAN["fx2"]}
     if line:
         with pytest.raises(InputError, match=line):
             read_trial(table, FREE)
     else:
-        assert any(
-            "columns fx3 are left out: hands have two fingers" in w for w in read_trial(table, FREE).warnings
-        )
+        assert any("columns fx3 are left out: hands have two fingers" in w
+                   for w in read_trial(table, FREE).warnings)  # fmt: skip
 
 
 def test_y_that_points_down_is_told():
@@ -196,19 +197,12 @@ def test_quiet_at_other_paces_and_sizes(pace, scale):
 
 
 def test_quiet_on_everything_shared(shared):
-    warned = [
-        str(file.relative_to(shared))
-        for kind in ("recordings", "recordings_general", "recordings_spent", "panda")
-        for rig_file in sorted((shared / kind).glob("*/rig.toml"))
-        for file in sorted(rig_file.parent.glob("trial_*.csv"))
-        if read_trial(file, read_rig(rig_file)).warnings
-    ]
+    warned = [str(file.relative_to(shared))
+              for kind in ("recordings", "recordings_general", "recordings_spent", "panda")
+              for rig_file in sorted((shared / kind).glob("*/rig.toml"))
+              for file in sorted(rig_file.parent.glob("trial_*.csv"))
+              if read_trial(file, read_rig(rig_file)).warnings]  # fmt: skip
     assert {Path(name).parent.name for name in warned} == {"wrist_untared"}  # and it should be
-
-
-GF, KGF = 9.80665e-3, 9.80665
-FORCES = ("fx1", "fy1", "fx2", "fy2")
-PLAIN, SWAYING = Setup(), Setup(heading=0.9, tilt=0.1, offset=(1.0, 2.0, 3.0), reaction=True)
 
 
 def scaled(columns, names, factor):
@@ -242,9 +236,8 @@ def test_exchanged_axes_are_refused_with_what_mends_them(pairs, line):
 @pytest.mark.parametrize(("unit", "size"), [("gf", GF), ("kgf", KGF)])
 def test_forces_whose_noise_is_another_units(unit, size):
     rng = np.random.default_rng(0)
-    table = CARTESIAN | {
-        name: CARTESIAN[name] + 0.05 * rng.normal(size=CARTESIAN["t"].size) for name in FORCES
-    }
+    table = CARTESIAN | {name: CARTESIAN[name] + 0.05 * rng.normal(size=CARTESIAN["t"].size)
+                         for name in FORCES}  # fmt: skip
     rig = parse_rig({"noise": {"force": 0.05}})
     assert read_trial(table, rig).warnings == ()
     (line,) = read_trial(scaled(table, FORCES, 1 / size), rig).warnings
@@ -333,9 +326,8 @@ def test_the_lines_mend_what_they_refuse(performed):
             table["columns"] = entry
         trial = read_trial(columns, parse_rig(table))
         for name in ("fy1", "y1"):
-            np.testing.assert_allclose(
-                np.abs(trial.channels[name]), np.abs(healthy.channels[name]), atol=0.02
-            )
+            np.testing.assert_allclose(np.abs(trial.channels[name]), np.abs(healthy.channels[name]),
+                                       atol=0.02)  # fmt: skip
 
 
 def test_one_force_on_both_fingers_of_a_jointed_hand_is_refused():

@@ -104,8 +104,7 @@ def test_a_jump_is_seen_and_a_level_cut_in_two_is_not():
     level = np.repeat([0.0, 0.0, 1.5], 60)
     values = [level[:, None] + 0.3 * rng.normal(size=(180, 2)) for _ in range(3)]
     found = np.exp(seen(values, [np.repeat([0, 1, 2], 60)] * 3, 3, share=2.0))
-    assert found[0] < 0.01
-    assert found[1] > 0.999
+    assert found[0] < 0.01 and found[1] > 0.999
 
 
 def test_the_best_choice_has_most_boundaries_right():
@@ -141,11 +140,8 @@ def test_boundaries_and_gain_from_the_joint_table_of_naming_and_label():
         named = rng.dirichlet(np.ones(changes), 2)
         emissions = StudentEmissions(np.zeros((1, 1)), np.ones((1, 1)))
         tables.append(crossing)
-        courses.append(
-            NamedCourse(
-                0.5, emissions, np.ones(changes + 1), named, np.array([[0.0], [3.0]] * np.ones(changes))
-            )
-        )
+        courses.append(NamedCourse(0.5, emissions, np.ones(changes + 1), named,
+                                   np.array([[0.0], [3.0]] * np.ones(changes))))  # fmt: skip
     crossing, gains = mix(tables, courses, lag)
     offsets = np.arange(-40, 41)
     law = np.exp(-np.abs(offsets) / 1.5)
@@ -252,10 +248,8 @@ def test_no_other_interval_that_holds_nine_tenths_is_shorter():
 
 def test_a_channel_that_ends_early_or_is_constant_dates_no_jump():
     trials, truth = ambiguous(3, events=(3.0, 6.0), levels=(0.0, 2.0, -1.0), noise=0.1)
-    more = {
-        "flat": np.full(trials[0].t.size, 3.0),
-        "ends": np.where(trials[0].t < 4, np.sin(1e3 * trials[0].t), np.nan),
-    }
+    more = {"flat": np.full(trials[0].t.size, 3.0),
+            "ends": np.where(trials[0].t < 4, np.sin(1e3 * trials[0].t), np.nan)}  # fmt: skip
     both = [replace(t, channels=t.channels | more) for t in trials]
     task = SequenceTask(("a", "b", "c"))
     alone = [[s.start for s in found.spans] for found in segment_sequence(trials, task)]
@@ -271,8 +265,7 @@ def test_cells_average_samples_and_stay_empty_where_there_are_none():
     np.testing.assert_allclose(edges, [0, 1, 2, 3])
     np.testing.assert_allclose(means[:, 0], [1.5, 6.0, 9.0])
     edges, means = cell_means(trial, ("a",), 0.5)
-    assert np.isnan(means[3, 0])
-    assert edges[-1] == pytest.approx(3.0)
+    assert np.isnan(means[3, 0]) and edges[-1] == pytest.approx(3.0)
 
 
 def test_readings_repeated_to_the_last_digit_are_old_ones():
@@ -340,8 +333,7 @@ def test_emissions_shrug_off_outliers():
     x = rng.normal(2.0, 0.5, size=(500, 1))
     x[:15] = 80.0
     emissions = from_weights(x, np.ones((500, 1)), 0.01, 1.0, iterations=50)
-    assert emissions.loc[0, 0] == pytest.approx(2.0, abs=0.1)
-    assert 0.3 < emissions.scale[0, 0] < 0.7
+    assert emissions.loc[0, 0] == pytest.approx(2.0, abs=0.1) and 0.3 < emissions.scale[0, 0] < 0.7
 
 
 def test_missing_features_say_nothing():

@@ -63,9 +63,8 @@ def test_every_round_is_aligned(moves, repeat):
     assert len(aligned.trials[0].boundaries) == starts.size and aligned.trials[0].present.all()
 
 
-@pytest.mark.parametrize(
-    ("repeat", "number", "at"), [("unknown", 10, 6), (10, 10, 6), ("unknown", 100, 56), (100, 100, 56)]
-)
+@pytest.mark.parametrize(("repeat", "number", "at"),
+                         [("unknown", 10, 6), (10, 10, 6), ("unknown", 100, 56), (100, 100, 56)])  # fmt: skip
 def test_a_drop_in_one_round_leaves_the_others(repeat, number, at):
     aligned, truth = aligned_session((0,), number, repeat, dropped=at)
     trial, steps = aligned.trials[0], aligned.subtasks
@@ -96,8 +95,7 @@ def test_a_block_gripped_again_makes_no_further_round():
 def test_too_few_or_too_many_rounds(shown, asked):
     aligned, _ = aligned_session((0,), shown, asked)
     found = aligned.trials[0].segmentation
-    assert found.repetitions == shown and found.failed is not None
-    assert found.failed.repetition == 6
+    assert found.repetitions == shown and found.failed is not None and found.failed.repetition == 6
     words = "ends before it" if shown < asked else "goes on after the task's end with another grip at "
     assert words in found.failed.reason
 

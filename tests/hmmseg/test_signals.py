@@ -57,26 +57,22 @@ def rolling_trial(number: int, angle: float, world: str = "50 Hz") -> tuple[Tria
             mean = mean + (a == "y") * {"": higher, "v": np.gradient(higher, s.t), "f": 0.0}[kind]
             c[f"{kind}{a}1"], c[f"{kind}{a}2"] = mean - new / 2, mean + new / 2
     sd_x, sd_y, sd_v = (float(np.median(v)) * np.sqrt(2) for v in (s.sd_x, s.sd_y, s.sd_vx))
-    noise = Noise(
-        position=float(np.hypot(sd_x, sd_y) / np.sqrt(2)), velocity=sd_v, force=judged.rig.noise.force
-    )
+    noise = Noise(position=float(np.hypot(sd_x, sd_y) / np.sqrt(2)), velocity=sd_v,
+                  force=judged.rig.noise.force)  # fmt: skip
     rig = Rig(rate=judged.rig.rate, gravity=judged.rig.gravity, fingertip=judged.rig.fingertip, noise=noise)
     return replace(judged.trial, channels=c | {ROLL: roll}), rig, b
 
 
-FINGERS = {
-    "1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
-    "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]},
-}
+FINGERS = {"1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
+           "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]}}  # fmt: skip
 JOINTED = parse_rig({"fingers": FINGERS, "noise": {"angle": 2e-4, "velocity": 0.03, "force": 0.012}})
 CARTESIAN = parse_rig({"noise": {"position": 1e-4, "velocity": 0.01, "force": 0.02}})
 
 
 def cartesian(samples=12) -> pd.DataFrame:
     values = np.random.default_rng(0).normal(scale=0.1, size=(samples, len(CARTESIAN_CHANNELS)))
-    return pd.DataFrame(
-        {"t": np.arange(samples) * 0.05} | dict(zip(CARTESIAN_CHANNELS, values.T, strict=True))
-    )
+    return pd.DataFrame({"t": np.arange(samples) * 0.05} | dict(zip(CARTESIAN_CHANNELS, values.T,
+                                                                    strict=True)))  # fmt: skip
 
 
 def test_noise_of_a_position_agrees_with_samples():
@@ -101,9 +97,8 @@ def test_cartesian_velocities_given_or_derived():
     t = frame["t"].to_numpy()
     frame["x1"], frame["x2"] = t**2 / 100, t**2 / 100 + 0.1
     frame.loc[7, "x1"] = np.nan
-    derived = task_space(
-        read_trial(frame.drop(columns=["vx1", "vy2"]).assign(vx2=np.nan), CARTESIAN), CARTESIAN
-    )
+    derived = task_space(read_trial(frame.drop(columns=["vx1", "vy2"]).assign(vx2=np.nan), CARTESIAN),
+                         CARTESIAN)  # fmt: skip
     assert np.isnan(derived.vx1[7])
     np.testing.assert_allclose(np.delete(derived.vx1, 7)[1:-1], np.delete(t, 7)[1:-1] / 50, atol=1e-12)
     np.testing.assert_allclose(derived.vx2[1:-1], t[1:-1] / 50, atol=1e-12)
@@ -112,9 +107,8 @@ def test_cartesian_velocities_given_or_derived():
 
 def test_noise_of_a_derived_velocity_agrees_with_samples():
     rng, n = np.random.default_rng(2), 20_000
-    frame = pd.DataFrame(
-        {"t": np.arange(n) * 0.01, **{name: 0.0 for name in CARTESIAN_CHANNELS if "v" not in name}}
-    )
+    frame = pd.DataFrame({"t": np.arange(n) * 0.01,
+                          **{name: 0.0 for name in CARTESIAN_CHANNELS if "v" not in name}})  # fmt: skip
     for name in ("x1", "y1", "x2", "y2"):
         frame[name] = rng.normal(scale=1e-4, size=n)
     signals = task_space(read_trial(frame, CARTESIAN), CARTESIAN)
@@ -126,10 +120,8 @@ def test_task_space_of_a_grip():
     frame = cartesian()
     frame = frame.assign(fx1=2.0, fx2=-1.5, fy1=0.3, fy2=0.1, x1=0.1, x2=0.13, y1=0.02, y2=0.05)
     signals = task_space(read_trial(frame, CARTESIAN), CARTESIAN)
-    found = {
-        name: getattr(signals, name)[0]
-        for name in ("grip", "fx", "fy", "shear", "distance", "offset", "x", "y")
-    }
+    found = {name: getattr(signals, name)[0]
+             for name in ("grip", "fx", "fy", "shear", "distance", "offset", "x", "y")}  # fmt: skip
     assert found == pytest.approx({"grip": 1.5, "fx": 0.5, "fy": 0.4, "shear": 0.1, "distance": 0.03,
                                    "offset": 0.03, "x": 0.115, "y": 0.035})  # fmt: skip
 
@@ -212,8 +204,7 @@ def test_rates_beside_a_kink_are_those_of_their_own_side():
     t = np.arange(40) * 0.05
     kink = t[20]
     left, right = one_sided(t, np.where(t < kink, 0.3 * t + 0.1 * t**2, 0.3 * kink + 0.1 * kink**2))[0]
-    assert left[20] == pytest.approx(0.3 + 0.2 * kink, rel=1e-6)
-    assert right[20] == pytest.approx(0.0, abs=1e-9)
+    assert left[20] == pytest.approx(0.3 + 0.2 * kink, rel=1e-6) and right[20] == pytest.approx(0.0, abs=1e-9)
     t, rng = np.arange(20_000) * 0.05, np.random.default_rng(1)
     rates, noise = one_sided(t, rng.standard_normal(t.size))
     assert rates[:, 5:-5].std() == pytest.approx(noise, rel=0.03)

@@ -14,13 +14,19 @@ from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS
 from hmmseg.io.units import UNITS, known_unit, measures, si_factor, unit_in_name
 
-FINGERS = {
-    "1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
-    "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]},
-}
+FINGERS = {"1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
+           "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]}}  # fmt: skip
 JOINTED = parse_rig({"fingers": FINGERS, "noise": {"angle": 2e-4, "velocity": 0.03, "force": 0.012}})
 CARTESIAN = parse_rig({"noise": {"position": 1e-4, "velocity": 0.01, "force": 0.02}})
 PLAIN = SequenceTask(("a", "b"))
+THEIRS = {"t": ("stamp", "ns", 1, 0.0), "x1": ("left x [mm]", "mm", -1, 0.25), "y1": ("ly", "cm", 1, 0.0),
+          "vx1": ("lvx", 1e-3, -1, 0.0), "fx1": ("lfx", "mN", -1, 0.1),
+          "fy2": ("rfy", "kgf", 1, -0.5)}  # fmt: skip
+TWO = SequenceTask(("a", "b"), channels=("x", "f"))
+T = np.arange(12) * 0.05
+X = np.round(np.sin(T) * 3, 4)
+F = np.round(np.cos(T) * 1234.5, 3)
+EVEN = "t,x,f\n" + "".join(f"{t:.2f},1,{f:.3f}\n" for t, f in zip(T, F, strict=True))
 
 
 def table(channels=JOINT_CHANNELS, samples=12) -> pd.DataFrame:
@@ -44,8 +50,7 @@ def test_every_kind_of_file_holds_the_same_trial(tmp_path):
     np.savez(tmp_path / "a.npz", **{name: frame[name].to_numpy() for name in frame})
     for name in ("a.csv", "a.parquet", "a.npz"):
         trial = read_trial(tmp_path / name, JOINTED)
-        assert set(trial.channels) == set(JOINT_CHANNELS)
-        assert trial.name == name
+        assert set(trial.channels) == set(JOINT_CHANNELS) and trial.name == name
         assert_same(trial, frame)
     assert_same(read_trial(frame.set_index(np.arange(100, 112)), JOINTED), frame)
 
@@ -73,9 +78,7 @@ def test_missing_cells_and_uneven_times(tmp_path):
     frame.loc[5, "q12"] = np.nan
     assert_same(trial, frame)
     signals = task_space(trial, JOINTED)
-    assert np.isnan(signals.fx[3])
-    assert np.isnan(signals.x[5])
-    assert np.isfinite(signals.fy[[3, 5]]).all()
+    assert np.isnan(signals.fx[3]) and np.isnan(signals.x[5]) and np.isfinite(signals.fy[[3, 5]]).all()
 
 
 def test_integers_and_nullable_columns():
@@ -109,34 +112,33 @@ def cell(row, column, text):
     return csv(change)  # fmt: skip
 
 
-REFUSED_CSV = [
-    ("", "column t: missing; expected a header row with a column t of times in s"),
-    (csv(lambda lines: lines[1:]), "column t: missing; expected a header row"),
-    (csv(lambda lines: [lines[0].replace("fx1", "fz1"), *lines[1:]]), "column fx1: missing; expected t, q"),
-    (csv(lambda lines: [lines[0].replace("fx1", "q11"), *lines[1:]]), "column q11: appears twice"),
-    (csv(lambda lines: lines[:8]), "has 7 samples; expected at least 8"),
-    (csv(lambda lines: lines[:1]), "has 0 samples; expected at least 8"),
-    (csv(lambda lines: [*lines[:4], lines[4] + ",1,2", *lines[5:]]),
-     "row 5: has 15 cells; expected 13 as in the header"),
-    (csv(lambda lines: [lines[0], *(line + ",1" for line in lines[1:])]),
-     "row 2: has 14 cells; expected 13"),
-    (csv(lambda lines: [*lines[:6], "0.55,0.3", *lines[6:]]),
-     "row 7: has 2 cells; expected 13 as in the header"),
-    (cell(5, "fy2", "x"), "row 5, column fy2: x is not a finite number; expected a number or an empty cell"),
-    (cell(5, "fy2", "inf"), "row 5, column fy2: inf is not a finite number"),
-    (cell(5, "fy2", "0.1.2"), "row 5, column fy2: 0.1.2 is not a finite number"),
-    (cell(2, "t", "soon"), "row 2, column t: soon is not a finite number"),
-    (cell(4, "t", ""), "row 4, column t: missing; expected a time in s"),
-    (cell(4, "t", "0.05"), "row 4, column t: 0.05 after 0.05; expected strictly increasing times"),
-    (cell(4, "t", "1700000000.1"), "row 5, column t: 0.15 after 1700000000.1; expected strictly"),
-    (cell(4, "t", "-1"), "row 4, column t: -1 after 0.05; expected strictly increasing"),
-    ("\n" + csv(lambda lines: lines[1:]), "column t: missing; expected a header row"),
-    (csv(lambda lines: [*lines[:4], "", "", cell(5, "q11", "?").splitlines()[4], *lines[5:]]),
-     r"row 7, column q11: \? is not a finite number"),
-]  # fmt: skip
+REFUSED_CSV = [("", "column t: missing; expected a header row with a column t of times in s"),
+               (csv(lambda lines: lines[1:]), "column t: missing; expected a header row"),
+               (csv(lambda lines: [lines[0].replace("fx1", "fz1"), *lines[1:]]),
+                "column fx1: missing; expected t, q"),
+               (csv(lambda lines: [lines[0].replace("fx1", "q11"), *lines[1:]]), "column q11: appears twice"),
+               (csv(lambda lines: lines[:8]), "has 7 samples; expected at least 8"),
+               (csv(lambda lines: lines[:1]), "has 0 samples; expected at least 8"),
+               (csv(lambda lines: [*lines[:4], lines[4] + ",1,2", *lines[5:]]),
+                "row 5: has 15 cells; expected 13 as in the header"),
+               (csv(lambda lines: [lines[0], *(line + ",1" for line in lines[1:])]),
+                "row 2: has 14 cells; expected 13"), (csv(lambda lines: [*lines[:6], "0.55,0.3", *lines[6:]]),
+                                                      "row 7: has 2 cells; expected 13 as in the header"),
+               (cell(5, "fy2", "x"),
+                "row 5, column fy2: x is not a finite number; expected a number or an empty cell"),
+               (cell(5, "fy2", "inf"), "row 5, column fy2: inf is not a finite number"),
+               (cell(5, "fy2", "0.1.2"), "row 5, column fy2: 0.1.2 is not a finite number"),
+               (cell(2, "t", "soon"), "row 2, column t: soon is not a finite number"),
+               (cell(4, "t", ""), "row 4, column t: missing; expected a time in s"),
+               (cell(4, "t", "0.05"), "row 4, column t: 0.05 after 0.05; expected strictly increasing times"),
+               (cell(4, "t", "1700000000.1"), "row 5, column t: 0.15 after 1700000000.1; expected strictly"),
+               (cell(4, "t", "-1"), "row 4, column t: -1 after 0.05; expected strictly increasing"),
+               ("\n" + csv(lambda lines: lines[1:]), "column t: missing; expected a header row"),
+               (csv(lambda lines: [*lines[:4], "", "", cell(5, "q11", "?").splitlines()[4], *lines[5:]]),
+                r"row 7, column q11: \? is not a finite number")]  # fmt: skip
 
 
-REFUSED_TABLES = [
+@pytest.mark.parametrize(("frame", "message"), [
     (table().assign(fx1=np.nan), "DataFrame: column fx1: has no values; expected at least one number"),
     (table().assign(fx1=["a"] * 12), "DataFrame: row 1, column fx1: a is not a finite number"),
     (table().assign(fx1=pd.Timestamp("2020-01-01")),
@@ -150,10 +152,7 @@ REFUSED_TABLES = [
      r"DataFrame: row 4, column fy2: -1e\+300 is no reading of a hand's sensor"),
     (table().assign(t=[*np.arange(11) * 0.05, 1e200]),
      r"DataFrame: .*column t: 1e\+200 is no time; expected a time in s"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("frame", "message"), REFUSED_TABLES)
+])  # fmt: skip
 def test_dataframe_refused_with_its_message(frame, message):
     with pytest.raises(InputError, match=f"^{message}"):
         read_trial(frame, JOINTED)
@@ -205,19 +204,12 @@ def scene(samples: int = 40) -> dict[str, np.ndarray]:
     return {"t": np.arange(samples) * 0.02, **columns}
 
 
-THEIRS = {
-    "t": ("stamp", "ns", 1, 0.0), "x1": ("left x [mm]", "mm", -1, 0.25), "y1": ("ly", "cm", 1, 0.0),
-    "vx1": ("lvx", 1e-3, -1, 0.0), "fx1": ("lfx", "mN", -1, 0.1), "fy2": ("rfy", "kgf", 1, -0.5),
-}  # fmt: skip
-
-
 def test_mapping_is_undone_by_units_sign_and_offset():
     ours = scene()
     theirs = dict(ours)
     for name, (source, unit, sign, offset) in THEIRS.items():
-        theirs[source] = (
-            (theirs.pop(name) - offset) * sign / (si_factor(unit) if isinstance(unit, str) else unit)
-        )
+        theirs[source] = (theirs.pop(name) - offset) * sign / (si_factor(unit) if isinstance(unit, str)
+                                                               else unit)  # fmt: skip
     theirs["name alone"] = theirs.pop("y2")
     rig = parse_rig({"columns": {
         name: {"from": source, "unit": unit, "sign": sign, "offset": offset}
@@ -243,19 +235,15 @@ def test_a_plain_task_takes_mapped_and_own_names():
     table = {"stamp": np.arange(10) * 20.0, "F": np.arange(10.0), "other": np.ones(10)}
     rig = parse_rig({"columns": {"t": {"from": "stamp", "unit": "ms"}, "force": {"from": "F", "unit": "mN"}}})
     trial = read_trial(table, rig, PLAIN)
-    assert sorted(trial.channels) == ["force", "other"]
-    assert trial.rate == pytest.approx(50.0)
+    assert sorted(trial.channels) == ["force", "other"] and trial.rate == pytest.approx(50.0)
     np.testing.assert_allclose(trial.channels["force"], np.arange(10) * 1e-3)
 
 
 def test_dates_become_seconds_since_the_first():
     ours = scene(10)
     stamps = np.datetime64("2026-11-23T15:00:00.5", "ns") + (ours["t"] * 1e9).astype("timedelta64[ns]")
-    for t in (
-        stamps,
-        np.array([f"{s}Z" for s in stamps], dtype=object),
-        pd.Series(stamps).dt.tz_localize("CET"),
-    ):
+    for t in (stamps, np.array([f"{s}Z" for s in stamps], dtype=object),
+              pd.Series(stamps).dt.tz_localize("CET")):  # fmt: skip
         trial = read_trial({**ours, "t": t}, parse_rig({}))
         np.testing.assert_allclose(trial.t, ours["t"], atol=1e-12)
         assert trial.origin is not None
@@ -271,9 +259,7 @@ def test_mappings_that_do_not_fit_the_file():
 
 
 def test_units():
-    assert si_factor("mm") == 1e-3
-    assert known_unit("Milliseconds") == "ms"
-    assert known_unit("N m") == "Nm"
+    assert si_factor("mm") == 1e-3 and known_unit("Milliseconds") == "ms" and known_unit("N m") == "Nm"
     assert known_unit("parsec") is None
     for name in UNITS:
         assert known_unit(name) == name
@@ -290,12 +276,6 @@ def test_unit_in_a_name(name, unit):
     assert unit_in_name(name) == unit
 
 
-TWO = SequenceTask(("a", "b"), channels=("x", "f"))
-T = np.arange(12) * 0.05
-X = np.round(np.sin(T) * 3, 4)
-F = np.round(np.cos(T) * 1234.5, 3)
-
-
 def written(separator=",", decimal=".", head="t,x,f", before=(), after_header=(), comment_after=None):
     rows = [separator.join(str(v).replace(".", decimal) for v in row) for row in zip(T, X, F, strict=True)]
     if comment_after is not None:
@@ -303,29 +283,24 @@ def written(separator=",", decimal=".", head="t,x,f", before=(), after_header=()
     return "\n".join([*before, head.replace(",", separator), *after_header, *rows]) + "\n"
 
 
-LAYOUTS = {
-    "commas": written(),
-    "semicolons": written(";"),
-    "semicolons and decimal commas": written(";", ","),
-    "tabs": written("\t"),
-    "tabs and decimal commas": written("\t", ","),
-    "spaces": written("   "),
-    "comments before and between": written(";", ",", before=["# lab 3", "% 2026", ""], comment_after=4),
-    "header in a comment (numpy.savetxt)": written(",", head="# t,x,f"),
-    "header in a comment, spaces": written(" ", head="# t,x,f"),
-    "windows line ends": written(";").replace("\n", "\r\n"),
-    "quoted": written(head='"t","x","f"'),
-    "trailing separators": written().replace("\n", ",\n"),
-    "scientific": written().replace("0.05,", "5.0E-2,", 1),
-    "empty last rows": written(";") + ";;\n\n",
-    "the separator said first": "sep=;\n" + written(";", ","),
-    "any separator said first": "SEP=|\n" + written("|"),
-    "signs before the header and its first name": written(" ", head="# #t,x,f", before=["# lab 3, a stand"]),
-    "a remark behind the header in a comment": written(head="#t,x,f", after_header=["# one, two"]),
-    "separators behind the rows alone": written().replace("\n", ",\n").replace("f,\n", "f\n", 1),
-    "no line end after the last row": written()[:-1],
-    "a spreadsheet's Unicode text": written("\t", ",").encode("utf-16"),
-}
+LAYOUTS = {"commas": written(), "semicolons": written(";"),
+           "semicolons and decimal commas": written(";", ","), "tabs": written("\t"),
+           "tabs and decimal commas": written("\t", ","), "spaces": written("   "),
+           "comments before and between": written(";", ",", before=["# lab 3", "% 2026", ""],
+                                                  comment_after=4),
+           "header in a comment (numpy.savetxt)": written(",", head="# t,x,f"),
+           "header in a comment, spaces": written(" ", head="# t,x,f"),
+           "windows line ends": written(";").replace("\n", "\r\n"), "quoted": written(head='"t","x","f"'),
+           "trailing separators": written().replace("\n", ",\n"),
+           "scientific": written().replace("0.05,", "5.0E-2,", 1), "empty last rows": written(";") + ";;\n\n",
+           "the separator said first": "sep=;\n" + written(";", ","),
+           "any separator said first": "SEP=|\n" + written("|"),
+           "signs before the header and its first name": written(" ", head="# #t,x,f",
+                                                                 before=["# lab 3, a stand"]),
+           "a remark behind the header in a comment": written(head="#t,x,f", after_header=["# one, two"]),
+           "separators behind the rows alone": written().replace("\n", ",\n").replace("f,\n", "f\n", 1),
+           "no line end after the last row": written()[:-1],
+           "a spreadsheet's Unicode text": written("\t", ",").encode("utf-16")}  # fmt: skip
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -339,12 +314,9 @@ def test_layouts_hold_the_same_numbers(tmp_path, layout):
     assert trial.warnings == ()
 
 
-EVEN = "t,x,f\n" + "".join(f"{t:.2f},1,{f:.3f}\n" for t, f in zip(T, F, strict=True))
-BROKEN_OFF = {
-    "in a row": (written() + "0.6,1", "row 14, the last, is cut off"),
-    "in a number": (EVEN + "0.6,1,12.", "row 14, the last, ends within a number"),
-    "in zero bytes": (written() + "\0" * 900, "ends in zero bytes"),
-}  # fmt: skip
+BROKEN_OFF = {"in a row": (written() + "0.6,1", "row 14, the last, is cut off"),
+              "in a number": (EVEN + "0.6,1,12.", "row 14, the last, ends within a number"),
+              "in zero bytes": (written() + "\0" * 900, "ends in zero bytes")}  # fmt: skip
 
 
 @pytest.mark.parametrize("how", BROKEN_OFF)
@@ -404,10 +376,9 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("text", "line", "read"),
-    [*((*each, {"rig": JOINTED}) for each in REFUSED_CSV), *((*each, {"task": TWO}) for each in REFUSED)],
-)
+@pytest.mark.parametrize(("text", "line", "read"),
+                         [*((*each, {"rig": JOINTED}) for each in REFUSED_CSV),
+                          *((*each, {"task": TWO}) for each in REFUSED)])  # fmt: skip
 def test_csv_refused_with_its_line(tmp_path, text, line, read):
     path = tmp_path / "a.csv"
     path.write_text(text)

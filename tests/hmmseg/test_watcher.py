@@ -35,6 +35,7 @@ CASE = RECORDINGS / "paper_blocks"
 TASK, RIG = CASE / "task.toml", CASE / "rig.toml"
 NONE = RECORDINGS / "none_1"
 TRUTH = json.loads((CASE / "truth" / "trial_01.json").read_text())["boundaries"]
+SETUP = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))  # untared
 
 
 def read(file=CASE / "trial_01.csv", rig=RIG):
@@ -106,13 +107,10 @@ def test_one_answer_a_row_and_a_last_one(watched):
     assert len(lines) == 200
     wanted = {"t", "subtask", "object", "state", "probabilities", "next", "properties", "fits"}
     for line in lines:
-        assert wanted <= set(line)
-        assert len(line["probabilities"]) == 9
-        assert sum(line["probabilities"]) + line["departed"] == pytest.approx(1, abs=1e-5)
-        assert line["fits"]
+        assert wanted <= set(line) and len(line["probabilities"]) == 9
+        assert sum(line["probabilities"]) + line["departed"] == pytest.approx(1, abs=1e-5) and line["fits"]
     assert lines[0]["subtask"] == "pregrasp" and lines[0]["next"]["subtask"] == "pickup"
-    assert lines[-1]["next"] is None
-    assert final["final"] is True and final["fits"]
+    assert lines[-1]["next"] is None and final["final"] is True and final["fits"]
 
 
 def test_boundaries_and_properties_agree_with_those_off_line(watched):
@@ -163,8 +161,7 @@ def test_a_block_let_go_in_mid_air_is_noticed():
     rest = int(np.searchsorted(t, 4.6))  # what free motion looks like
     table = np.vstack([table[:cut], table[rest : rest + 30]])
     lines = follow(Watcher(TASK, RIG), t[: len(table)], table)
-    assert all(line["fits"] for line in lines[:cut])
-    assert not lines[-1]["fits"]
+    assert all(line["fits"] for line in lines[:cut]) and not lines[-1]["fits"]
     assert lines[-1]["failed"]["subtask"] == "place"
 
 
@@ -249,8 +246,7 @@ def test_memory_and_hypotheses_do_not_grow():
         for at_, row in zip(t[:30], table[:30], strict=True):
             watcher.update(again * 2.0 + at_, row)
         sizes.append((len(watcher.filter.rows), watcher.filter._state.count))
-    assert len({rows for rows, _ in sizes[1:]}) == 1
-    assert max(count for _, count in sizes) < 100
+    assert len({rows for rows, _ in sizes[1:]}) == 1 and max(count for _, count in sizes) < 100
 
 
 def test_what_cannot_be_watched_is_refused():
@@ -298,9 +294,6 @@ def test_a_clock_that_leaps_leaves_few_hypotheses():
         assert len(mine) == state.count
 
 
-SETUP = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))  # untared
-
-
 @pytest.fixture(scope="module")
 def performed():
     simulated = performances(2)[1]
@@ -311,9 +304,8 @@ def follow_wrist(columns, rig, task=RESTACK, stop=None):
     watcher = Watcher(task, rig)
     lines = []
     for k, t in enumerate(columns["t"][:stop]):
-        lines.append(
-            json.loads(watcher.update(float(t), {n: columns[n][k] for n in watcher.channels}).line())
-        )
+        lines.append(json.loads(watcher.update(float(t), {n: columns[n][k]
+                                                          for n in watcher.channels}).line()))  # fmt: skip
     return watcher, lines, json.loads(watcher.finish().line())
 
 
@@ -328,8 +320,7 @@ def test_the_last_answer_agrees_with_that_off_line(performed, watched_wrist):
     rig = wrist_rig(SETUP)
     aligned = align([read_trial(columns, rig)], RESTACK, rig)
     spans, identified = aligned.segmentations[0].spans, identify_aligned(aligned)
-    assert final["fits"]
-    assert [c.step.name for c in watcher.crossings] == [s.subtask for s in spans[1:]]
+    assert final["fits"] and [c.step.name for c in watcher.crossings] == [s.subtask for s in spans[1:]]
     for crossing, span, true in zip(watcher.crossings, spans[1:], simulated.boundaries, strict=True):
         assert abs(crossing.t - span.start) < 3 * np.hypot(crossing.sd, span.start_sd)
         assert abs(crossing.t - true) < 3 * crossing.sd
@@ -457,10 +448,8 @@ def test_the_command_follows_a_wrist(performed, monkeypatch, capsys, tmp_path):
         '[gripper]\nposition = ["px", "py", "pz"]\nopening = "gap"\nwrench = ["Fx", "Fy", "Fz"]\n'
         "[fingertip]\nnormal_stiffness = 4000.0\nshear_stiffness = 2500.0\n"
     )
-    rows = [
-        ",".join(columns),
-        *(",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True)),
-    ]
+    rows = [",".join(columns),
+            *(",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True))]  # fmt: skip
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("\n".join(rows).encode() + b"\n")))
     code = main(["watch", "--task", str(tmp_path / "task.toml"), "--rig", str(tmp_path / "rig.toml")])
     out, err = capsys.readouterr()

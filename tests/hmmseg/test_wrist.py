@@ -137,8 +137,7 @@ def test_the_tool_is_found_from_free_motion(performed):
     pose = pose_of(trial, rig.gripper)
     free = trial.t < 1.5
     tool = free_tool(trial, rig, pose, free)
-    assert tool.mass == pytest.approx(1.3, rel=0.03)
-    assert np.linalg.det(tool.axes) == pytest.approx(-1)
+    assert tool.mass == pytest.approx(1.3, rel=0.03) and np.linalg.det(tool.axes) == pytest.approx(-1)
     np.testing.assert_allclose(tool.axes, -np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), atol=0.1)
     np.testing.assert_allclose(tool.offset, setup.offset, atol=0.4)
     force = applied_force(trial, rig, pose, tool)[free]
@@ -159,8 +158,7 @@ def test_the_tool_is_found_where_forces_come_late(performed, late):
 
     tool, usual = found(columns | delayed), found(columns)
     assert tool.delay == pytest.approx(-late, abs=1e-3)
-    assert tool.inertia == pytest.approx(usual.inertia, rel=0.05)
-    assert tool.noise < 1.2 * usual.noise
+    assert tool.inertia == pytest.approx(usual.inertia, rel=0.05) and tool.noise < 1.2 * usual.noise
 
 
 def test_an_open_hand_at_rest_holds_nothing():
@@ -273,9 +271,8 @@ def test_an_arm_of_another_simulator(shared):
     folder = shared / "panda" / "wrist_restack_1"
     aligned = align([read_trial(folder / f"wrist_0{k}.csv", ARM_RIG) for k in (1, 2, 3, 4)],
                     read_task(folder / "task.toml"), ARM_RIG)  # fmt: skip
-    truth = [
-        json.loads((folder / "truth" / f"trial_0{k}.json").read_text())["boundaries"] for k in (1, 2, 3, 4)
-    ]
+    truth = [json.loads((folder / "truth" / f"trial_0{k}.json").read_text())["boundaries"]
+             for k in (1, 2, 3, 4)]  # fmt: skip
     found = np.array([[span.end for span in s.spans[:-1]] for s in aligned.segmentations])
     assert np.median(np.abs(found - truth)) < 0.03
     blocks = json.loads((folder / "truth.json").read_text())

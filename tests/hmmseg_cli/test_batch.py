@@ -75,8 +75,7 @@ def test_what_is_wrong_with_one_recording_is_one_line(lab, capfd, tmp_path):
     (tmp_path / "bad.csv").write_text("t,x1\n0,1\n")
     arguments = ["--task", "task.toml", "--rig", "rig.toml", "--json", f"{tmp_path}/out.json"]
     assert main(["segment", "many/0.csv", f"{tmp_path}/bad.csv", *arguments, "--workers", "2"]) == 2
-    assert "bad.csv: " in (said := capfd.readouterr().err)
-    assert said.count("\n") == 1
+    assert "bad.csv: " in (said := capfd.readouterr().err) and said.count("\n") == 1
     assert not (tmp_path / "out.json").exists()
 
 

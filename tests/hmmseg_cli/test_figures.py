@@ -18,14 +18,9 @@ from hmmseg.segmentation.spans import Failure, Segmentation, Span
 
 T = np.arange(100) * 0.05
 NAMES = [("block1", "weight"), ("block1", "width"), ("block1", "height")]
-PROPERTIES = {
-    "block1": {
-        "weight": {"unit": "N", "mean": 0.35, "sd": 0.01, "interval_68": [0.34, 0.36],
-                   "interval_95": [0.33, 0.37]},
-        "width": None,
-        "friction": {"lower_bound": 0.5},
-    }
-}  # fmt: skip
+PROPERTIES = {"block1": {"weight": {"unit": "N", "mean": 0.35, "sd": 0.01, "interval_68": [0.34, 0.36],
+                                    "interval_95": [0.33, 0.37]}, "width": None,
+                         "friction": {"lower_bound": 0.5}}}  # fmt: skip
 
 
 @pytest.fixture

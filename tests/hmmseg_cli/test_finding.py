@@ -64,13 +64,10 @@ def test_every_effect_has_a_plain_name_and_a_check():
             assert plain_name(whole) == called + (" (arm x)" if whole != kind else "")
             assert checks([whole]) == [check] and check.endswith(".")
     assert plain_name("readout:z.gain") == "a reading that is off by a factor (z)"
-    assert (
-        plain_name("gravity_compensation") == "gravity compensation"
-        and checks(["gravity_compensation"]) == []
-    )
-    assert plain_name("fingertip_compliance", {"normal_stiffness": 1200.0}, {"normal_stiffness": 4000.0}) == (
-        "softer fingertips"
-    )
+    assert (plain_name("gravity_compensation") == "gravity compensation"
+            and checks(["gravity_compensation"]) == [])  # fmt: skip
+    assert plain_name("fingertip_compliance", {"normal_stiffness": 1200.0},
+                      {"normal_stiffness": 4000.0}) == ("softer fingertips")  # fmt: skip
     assert plain_name("force_gain", {"finger1": 0.0, "finger2": -0.1}).endswith("too low (finger 2)")
     assert plain_name("force_lag", {"finger1": 0.1, "finger2": 0.0}).endswith("late of finger 1")
     assert plain_name("force_bias", {"fx1": 1.2, "fy1": 0.01}).endswith("force sensor fx1")
@@ -78,12 +75,11 @@ def test_every_effect_has_a_plain_name_and_a_check():
 
 
 def test_a_named_cause_is_told_with_what_it_leaves():
-    found = body(
-        "named", ["fingertip_compliance"],
-        attribution={"fingertip_compliance": {"probability": 0.94, "share": 0.87,
-                                              "interval_90": [0.8, 0.91]}},
-        remainder={"share": 0.13, "p_value": 1e-6, "where": [cell("offset", "carry block1", 0.1)]},
-    )  # fmt: skip
+    found = body("named", ["fingertip_compliance"],
+                 attribution={"fingertip_compliance": {"probability": 0.94, "share": 0.87,
+                                                       "interval_90": [0.8, 0.91]}},
+                 remainder={"share": 0.13, "p_value": 1e-6,
+                            "where": [cell("offset", "carry block1", 0.1)]})  # fmt: skip
     assert headline(found, {"normal_stiffness": 4000.0}) == "Softer fingertips"
     told = " ".join(sentences(found))
     assert "93 %" in told and "It explains 87 % of the gap (90 % interval 80 to 91 %)" in told
@@ -174,23 +170,21 @@ def test_every_verdict_has_a_page(verdict):
         more = {"where": []}
     measured = {"block1": {"width": (0.016, 0.0001)}} if causes else None
     text = page(body(verdict, causes, **more), Setting(["a.csv"], {}, measured), lambda path: None)
-    assert 'id="verdict"' in text and "<script" not in text
-    assert ('id="parameters"' in text) == bool(causes)
+    assert 'id="verdict"' in text and "<script" not in text and ('id="parameters"' in text) == bool(causes)
     if verdict != "none":
         assert text.count(">61 %<") == 1
     if causes:
         assert "3985 ± 180 N/m" in text and "1.6200 cm" in text
 
 
-ROBOT = {
-    "verdict": "unknown", "causes": [], "indistinguishable": [], "effects": {}, "numerics": {},
-    "detection": {"p_value": 0.0, "resolution": 0.0}, "next_experiment": None, "shrinkage": None,
-    "probabilities": {"none": 0.0, "unknown": 1.0}, "remainder": {"share": 1.0, "rms_over_noise": 11.5},
-    "explanation": {"effects": ["joint:slew.armature"], "doubts": ["11.5 times the noise is left"]},
-    "attribution": {"joint:slew.armature": {"probability": 0.68, "share": 0.0, "interval_90": [0.0, 0.0]}},
-    "where": [{"trial": "a.csv", "channel": "q1", "subtask": "moving", "band": [0.0, 50.0], "share": 1.0,
-               "z": 9.0}],
-}  # fmt: skip
+ROBOT = {"verdict": "unknown", "causes": [], "indistinguishable": [], "effects": {}, "numerics": {},
+         "detection": {"p_value": 0.0, "resolution": 0.0}, "next_experiment": None, "shrinkage": None,
+         "probabilities": {"none": 0.0, "unknown": 1.0}, "remainder": {"share": 1.0, "rms_over_noise": 11.5},
+         "explanation": {"effects": ["joint:slew.armature"], "doubts": ["11.5 times the noise is left"]},
+         "attribution": {"joint:slew.armature": {"probability": 0.68, "share": 0.0,
+                                                 "interval_90": [0.0, 0.0]}},
+         "where": [{"trial": "a.csv", "channel": "q1", "subtask": "moving", "band": [0.0, 50.0], "share": 1.0,
+                    "z": 9.0}]}  # fmt: skip
 
 
 def test_an_unknown_gap_of_a_robot_names_the_best_and_why_it_is_none():
@@ -217,10 +211,9 @@ def test_causes_that_act_together_are_listed_once_in_units_that_read_well():
         for n, (m, nominal, unit) in found.items()
     }  # fmt: skip
     pair, act = "+".join(found), {"probability": 0.5, "share": 0.5, "interval_90": None}
-    body = ROBOT | {
-        "verdict": "named", "causes": list(found), "effects": {pair: {"parameters": parameters}},
-        "probabilities": {pair: 0.99}, "attribution": dict.fromkeys(found, act), "explanation": None,
-    }  # fmt: skip
+    body = ROBOT | {"verdict": "named", "causes": list(found), "effects": {pair: {"parameters": parameters}},
+                    "probabilities": {pair: 0.99}, "attribution": dict.fromkeys(found, act),
+                    "explanation": None}  # fmt: skip
     assert headline(body) == "Arm: a load 89.4 g (model: 0) and slew: dry friction 0.451 N m (model: 0.0500)"
     assert chances(body) == dict.fromkeys(found, 0.99)
 

@@ -34,8 +34,7 @@ def test_process_at_fault_says_one_line_and_exits_with_2(tmp_path):
     done = run("decompose", "bad.toml", "--json", "out.json", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("bad.toml: move 1: unknown destination 'table'; expected one of block1, ")
-    assert done.stderr.count("\n") == 1
-    assert os.listdir(tmp_path) == ["bad.toml"]
+    assert done.stderr.count("\n") == 1 and os.listdir(tmp_path) == ["bad.toml"]
 
 
 def test_light_commands_do_not_import_heavy_modules():
@@ -46,11 +45,9 @@ def test_light_commands_do_not_import_heavy_modules():
 
 
 def test_version_and_help(capsys):
-    assert frame.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"{hmmseg.__version__}\n"
+    assert frame.main(["--version"]) == 0 and capsys.readouterr().out == f"{hmmseg.__version__}\n"
     for args in ([], ["--help"], ["-h"]):
-        assert frame.main(args) == 0
-        assert "decompose" in capsys.readouterr().out
+        assert frame.main(args) == 0 and "decompose" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("args", "line"), [
@@ -67,8 +64,7 @@ def test_version_and_help(capsys):
 def test_usage_at_fault(capsys, args, line):
     assert frame.main(args) == 2
     out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith(line)
+    assert (out, err.count("\n")) == ("", 1) and err.startswith(line)
 
 
 def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
@@ -117,8 +113,7 @@ def test_a_process_with_a_bug_shows_its_traceback(task):
         sys.exit(main.main(["decompose", sys.argv[1]]))
     """
     done = subprocess.run([sys.executable, "-c", code, task], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.startswith("Traceback")
+    assert done.returncode == 1 and done.stderr.startswith("Traceback")
     assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
 
 
@@ -158,8 +153,7 @@ def test_files_appear_together_at_the_end(tmp_path):
         assert os.listdir(tmp_path) == []
         out.finish({"value": 1})
     figure = tmp_path / "new/figures/one.png"
-    assert figure.read_bytes() == b"2"
-    assert (tmp_path / "r.html").read_text() == "<p>"
+    assert figure.read_bytes() == b"2" and (tmp_path / "r.html").read_text() == "<p>"
     document = json.loads((tmp_path / "a.json").read_text())
     assert document == {"format": "hmmseg.test/1", "version": hmmseg.__version__, "seed": 0,
                         "warnings": ["beware"], "figures": [str(figure)], "value": 1}  # fmt: skip
@@ -172,8 +166,7 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path):
           Output("test", json=str(tmp_path / "a.json"), figures=tmp_path / "figures") as out):  # fmt: skip
         out.figure("one.png").write_bytes(b"1")
         raise InputError("here", "wrong")
-    assert (tmp_path / "a.json").read_text() == "old"
-    assert os.listdir(tmp_path) == ["a.json"]
+    assert (tmp_path / "a.json").read_text() == "old" and os.listdir(tmp_path) == ["a.json"]
 
 
 def test_links_and_devices_are_written_through(tmp_path):
@@ -196,10 +189,8 @@ def test_standard_output_is_kept_clean(capsys):
             advance(3)
         out.finish({"value": np.nan})
     printed = capsys.readouterr()
-    assert json.loads(printed.out)["value"] is None
-    assert "to people\n" in printed.err
-    assert "a stray print\n" in printed.err
-    assert "warning: beware\n" in printed.err
+    assert json.loads(printed.out)["value"] is None and "to people\n" in printed.err
+    assert "a stray print\n" in printed.err and "warning: beware\n" in printed.err
 
 
 def test_quiet(capsys):

@@ -41,13 +41,19 @@ NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
 T = np.arange(0, 2, 0.02)
 WRIST = {"t": T, "width": 0.06 - 0.03 * (T > 1), "ee_y": 0.1 * T, "ee_z": 0.2 - 0.05 * T,
          **{f"{letter}{axis}": np.sin(T) for letter in "FT" for axis in "xyz"}}  # fmt: skip
-OTHERS = {
-    "t": ("stamp", 1e9), "x1": ("finger_left_x_mm", 1e3), "y1": ("finger_left_z_mm", 1e3),
-    "vx1": ("finger_left_vx", 1.0), "vy1": ("finger_left_vz", 1.0), "fx1": ("LeftForceX [mN]", 1e3),
-    "fy1": ("LeftForceZ [mN]", 1e3), "x2": ("finger_right_x", 1e3), "y2": ("finger_right_z", 1e3),
-    "vx2": ("finger_right_vx", 1.0), "vy2": ("finger_right_vz", 1.0), "fx2": ("RightForceX [mN]", -1e3),
-    "fy2": ("RightForceZ [mN]", -1e3),
-}  # fmt: skip
+OTHERS = {"t": ("stamp", 1e9), "x1": ("finger_left_x_mm", 1e3), "y1": ("finger_left_z_mm", 1e3),
+          "vx1": ("finger_left_vx", 1.0), "vy1": ("finger_left_vz", 1.0), "fx1": ("LeftForceX [mN]", 1e3),
+          "fy1": ("LeftForceZ [mN]", 1e3), "x2": ("finger_right_x", 1e3), "y2": ("finger_right_z", 1e3),
+          "vx2": ("finger_right_vx", 1.0), "vy2": ("finger_right_vz", 1.0), "fx2": ("RightForceX [mN]", -1e3),
+          "fy2": ("RightForceZ [mN]", -1e3)}  # fmt: skip
+FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
+RATE = 20
+SIDES = {"1": "links", "2": "rechts"}
+FINGER_NAMES = {name: (f"Finger_{SIDES[name[1]]}_{name[0]}_mm", 1e3) if len(name) == 2
+                else (f"Kraft_{SIDES[name[2]]}_{name[1]}_N", 1.0) for name in FINGERS
+                if name != "t"}  # fmt: skip
+WRIST_NAMES = {"width": ("Oeffnung_mm", 1e3), "ee_y": ("TCP_y_mm", 1e3), "ee_z": ("TCP_z_mm", 1e3),
+               **{f"F{axis}": (f"F{axis}_N", 1.0) for axis in "xyz"}}  # fmt: skip
 
 
 def test_times_that_are_refused_are_told_and_lead_nowhere(tmp_path, capsys):
@@ -65,9 +71,8 @@ def test_another_labs_file_is_read_with_what_inspect_proposes(tmp_path, capsys):
     frame["stamp"] = frame["stamp"].round().astype(np.int64)
     frame.to_csv(tmp_path / "a.csv", index=False, sep=";", decimal=",")
     (tmp_path / "rig.toml").write_text("gravity = 9.81\n")
-    assert (
-        main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--json", "-"]) == 0
-    )
+    assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--json",
+                 "-"]) == 0  # fmt: skip
     document = json.loads(capsys.readouterr().out)
     (file,) = document["files"]
     assert file["mapping"]["t"] == {"from": "stamp", "unit": "ns"}
@@ -180,9 +185,7 @@ def test_a_rig_that_cannot_take_the_mapping_stays_as_it_was(tmp_path, capsys, ri
     (tmp_path / "rig.toml").write_text(rig)
     assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--quiet"]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert re.search(line, error)
-    assert (tmp_path / "rig.toml").read_text() == rig
+    assert error.count("\n") == 1 and re.search(line, error) and (tmp_path / "rig.toml").read_text() == rig
 
 
 @pytest.mark.parametrize("hand", ["cartesian", "jointed", "gripper", "none"])
@@ -214,9 +217,8 @@ def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
 def test_new_never_hangs_and_never_writes_over(tmp_path):
     command = [Path(sys.executable).with_name("hmmseg"), "new", "lab"]
     for stdin in (subprocess.DEVNULL, subprocess.PIPE):
-        done = subprocess.run(
-            command, cwd=tmp_path, stdin=stdin, capture_output=True, timeout=60, check=False
-        )
+        done = subprocess.run(command, cwd=tmp_path, stdin=stdin, capture_output=True, timeout=60,
+                              check=False)  # fmt: skip
         text = done.stderr.decode()
         if stdin == subprocess.DEVNULL:
             assert (done.returncode, sorted(os.listdir(tmp_path / "lab"))) == (0, ["rig.toml", "task.toml"])
@@ -229,8 +231,7 @@ def test_new_fills_in_a_rig_from_a_recording(tmp_path, capsys):
     table.to_csv(tmp_path / "jointed.csv", index=False)
     assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 0
     text = (tmp_path / "one/rig.toml").read_text()
-    assert "rate = 20.0" in text and "[fingers.1]" in text
-    assert "hmmseg segment" in capsys.readouterr().out
+    assert "rate = 20.0" in text and "[fingers.1]" in text and "hmmseg segment" in capsys.readouterr().out
     assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 2
 
 
@@ -255,18 +256,6 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
     }  # fmt: skip
     assert (found.clock.column, found.clock.size) == ("ros_stamp", 1e-9)
     assert main(["new", str(tmp_path / "other"), "--model", str(tmp_path / "robot.xml")]) == 2
-
-
-FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
-RATE = 20
-SIDES = {"1": "links", "2": "rechts"}
-FINGER_NAMES = {
-    name: (f"Finger_{SIDES[name[1]]}_{name[0]}_mm", 1e3) if len(name) == 2
-    else (f"Kraft_{SIDES[name[2]]}_{name[1]}_N", 1.0)
-    for name in FINGERS if name != "t"
-}  # fmt: skip
-WRIST_NAMES = {"width": ("Oeffnung_mm", 1e3), "ee_y": ("TCP_y_mm", 1e3), "ee_z": ("TCP_z_mm", 1e3),
-               **{f"F{axis}": (f"F{axis}_N", 1.0) for axis in "xyz"}}  # fmt: skip
 
 
 def lerobot(folder, version, rate, columns):
@@ -332,9 +321,8 @@ def test_a_wrist_reads_as_recorded(tmp_path, wrist, kind, capsys):
     file, rig = WRIST_FILES[kind](tmp_path, wrist), tmp_path / "rig.toml"
     assert main(["inspect", str(file), "--write", str(rig), "--quiet"]) == 0
     if kind == "robomimic":  # its second finger counts the other way, and the line says so
-        task = written(
-            tmp_path / "task.toml", b'[objects.a]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n'
-        )
+        task = written(tmp_path / "task.toml",
+                       b'[objects.a]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n')  # fmt: skip
         assert main(["segment", str(file), "--task", str(task), "--rig", str(rig)]) == 2
         line = capsys.readouterr().err
         entry = line.split("expected ")[1].split(" under [columns]")[0]
@@ -342,6 +330,5 @@ def test_a_wrist_reads_as_recorded(tmp_path, wrist, kind, capsys):
     trial = read_trial(file, read_rig(rig))
     assert trial.warnings == ()
     for name in ("x1", "y1", "fy1", "x2", "y2", "fy2"):
-        np.testing.assert_allclose(
-            trial.channels[name], expected.channels[name], atol=1e-3 * (name[0] == "f") + 2e-5
-        )
+        np.testing.assert_allclose(trial.channels[name], expected.channels[name],
+                                   atol=1e-3 * (name[0] == "f") + 2e-5)  # fmt: skip

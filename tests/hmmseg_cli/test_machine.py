@@ -28,25 +28,27 @@ from hmmseg_cli.main import main, repeat_interrupts
 
 STACK = Path(__file__).parents[1] / "data/stack"
 HAND = ["--task", "task.toml", "--rig", "rig.toml"]
-COMMANDS = {
-    "decompose": ["decompose", "task.toml", "--json", "out.json"],
-    "effects": ["effects", "--json", "out.json"],
-    "inspect": ["inspect", "theirs.csv", "--write", "new.toml", "--json", "out.json"],
-    "new": ["new", "lab"],
-    "segment": ["segment", "trial.csv", *HAND, "--method", "qualitative", "--json", "out.json", "--write",
-                "labelled.csv"],
-    "identify": ["identify", "trial.csv", *HAND, "--method", "paper", "--json", "out.json", "--report",
-                 "page.html"],
-    "fit": ["fit", "trial.csv", "--task", "order.toml", "--model", "model.npz", "--json", "out.json"],
-    "simulate": ["simulate", *HAND, "--trials", "1", "--output", "made", "--json", "out.json"],
-    "watch": ["watch", *HAND, "--json", "out.json"],
-    "diagnose": ["diagnose", "trial.csv", "--against", "trial_2.csv", "trial_3.csv", "--task", "order.toml",
-                 "--json", "out.json"],
-}  # fmt: skip
+COMMANDS = {"decompose": ["decompose", "task.toml", "--json", "out.json"],
+            "effects": ["effects", "--json", "out.json"],
+            "inspect": ["inspect", "theirs.csv", "--write", "new.toml", "--json", "out.json"],
+            "new": ["new", "lab"], "segment": ["segment", "trial.csv", *HAND, "--method", "qualitative",
+                                               "--json", "out.json", "--write", "labelled.csv"],
+            "identify": ["identify", "trial.csv", *HAND, "--method", "paper", "--json", "out.json",
+                         "--report", "page.html"],
+            "fit": ["fit", "trial.csv", "--task", "order.toml", "--model", "model.npz", "--json", "out.json"],
+            "simulate": ["simulate", *HAND, "--trials", "1", "--output", "made", "--json", "out.json"],
+            "watch": ["watch", *HAND, "--json", "out.json"],
+            "diagnose": ["diagnose", "trial.csv", "--against", "trial_2.csv", "trial_3.csv", "--task",
+                         "order.toml", "--json", "out.json"]}  # fmt: skip
 INTERRUPTED = ("decompose", "inspect", "new", "segment", "identify", "fit", "simulate")
 COSTLY = {"watch": 30, "diagnose": 5}  # how many calls of each kind are refused at most
 QUICK = ("decompose", "new", "segment")
 ROWS = b"".join((STACK / "trial_01.csv").read_bytes().splitlines(keepends=True)[:40])
+FULL = OSError(28, "No space left on device")
+PROCESS = [sys.executable, "-c", "from hmmseg_cli import run; run()"]  # as the installed command has it
+MOVES = 'objects = {a = {on = "ground"}}\nmoves = [' + '{object = "a", to = "ground"},' * 20_000 + "]"
+STATES = "sequence = [" + ", ".join(f'"s{i}"' for i in range(9000)) + "]"
+COLUMNS = "t" + "".join(f",c{i}" for i in range(300_000)) + "\n0\n"
 
 
 @pytest.fixture
@@ -102,25 +104,18 @@ class Refusing:
 def own(path, *_):
     """Whether a path is data, and no code of a package that is still being imported."""
     name = os.fspath(path) if isinstance(path, str | os.PathLike) else ""
-    return (
-        not str(name).endswith((".py", ".pyc", ".so", ".afm", ".ttf", ".mplstyle"))
-        and "site-packages" not in name
-    )
+    return (not str(name).endswith((".py", ".pyc", ".so", ".afm", ".ttf", ".mplstyle"))
+            and "site-packages" not in name)  # fmt: skip
 
 
-FULL = OSError(28, "No space left on device")
-CALLS = {
-    "open": (builtins, "open", PermissionError(13, "Permission denied"), own),
-    "io.open": (io, "open", OSError(24, "Too many open files"), own),
-    "rename": (os, "replace", FULL, lambda *_: True),
-    "copy": (shutil, "copyfile", FULL, lambda *_: True),
-    "folder": (os, "mkdir", FULL, lambda *_: True),
-    "write": (os, "fdopen", FULL, lambda *_: True),
-    "sync": (os, "fsync", FULL, lambda *_: True),
-    "memory": (json, "dumps", MemoryError(), lambda *_: True),
-    "Ctrl-C in a copy": (shutil, "copyfile", KeyboardInterrupt(), lambda *_: True),
-    "Ctrl-C in a rename": (os, "replace", KeyboardInterrupt(), lambda *_: True),
-}
+CALLS = {"open": (builtins, "open", PermissionError(13, "Permission denied"), own),
+         "io.open": (io, "open", OSError(24, "Too many open files"), own),
+         "rename": (os, "replace", FULL, lambda *_: True),
+         "copy": (shutil, "copyfile", FULL, lambda *_: True), "folder": (os, "mkdir", FULL, lambda *_: True),
+         "write": (os, "fdopen", FULL, lambda *_: True), "sync": (os, "fsync", FULL, lambda *_: True),
+         "memory": (json, "dumps", MemoryError(), lambda *_: True),
+         "Ctrl-C in a copy": (shutil, "copyfile", KeyboardInterrupt(), lambda *_: True),
+         "Ctrl-C in a rename": (os, "replace", KeyboardInterrupt(), lambda *_: True)}  # fmt: skip
 
 
 def tortured(lab, name, kind, monkeypatch, capsys, most):
@@ -146,8 +141,7 @@ def tortured(lab, name, kind, monkeypatch, capsys, most):
         assert found.keys() in (before.keys(), whole.keys()), (at, found.keys() ^ before.keys())
         assert code != 130 or found == {name: whole[name] for name in found}, at
         assert code != 2 or (found == before and err.count("\n") >= 1), (at, err)
-        assert "Traceback" not in err
-        assert not [n for n in found if ".hmmseg" in n]
+        assert "Traceback" not in err and not [n for n in found if ".hmmseg" in n]
     return count.calls
 
 
@@ -172,20 +166,15 @@ def test_a_rename_that_is_refused_leaves_results_of_before(lab, monkeypatch, cap
     with monkeypatch.context() as patched:
         patched.setattr(os, "replace", Refusing(real, FULL, 1, lambda new, to: ".old" not in str(new)))
         assert main([*COMMANDS["fit"], "--seed", "3"]) == 2
-    assert files(lab) == before
-    assert "cannot be written (No space left on device)" in capsys.readouterr().err
-
-
-PROCESS = [sys.executable, "-c", "from hmmseg_cli import run; run()"]  # as the installed command has it
+    assert files(lab) == before and "cannot be written (No space left on device)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("stdout", ["closed", "full", "gone"])
 def test_without_a_reader_the_work_is_kept_and_said(stdout, lab):
     command = shlex.join([*PROCESS, *COMMANDS["decompose"]])
     end = {"closed": ">&-", "full": "> /dev/full", "gone": "| true"}[stdout]
-    run = subprocess.run(
-        ["bash", "-c", f"set -o pipefail; {{ sleep 0; {command}; }} {end}"], capture_output=True, text=True
-    )
+    run = subprocess.run(["bash", "-c", f"set -o pipefail; {{ sleep 0; {command}; }} {end}"],
+                         capture_output=True, text=True)  # fmt: skip
     assert (lab / "out.json").exists()
     assert "Traceback" not in run.stderr and "Exception ignored" not in run.stderr
     if stdout != "gone" or run.stderr:  # `true` may have read nothing yet when all was written
@@ -212,8 +201,7 @@ def test_names_may_hold_what_a_file_system_allows(lab, capsys):
     shutil.copyfile("trial.csv", odd)
     assert main(["segment", odd, *HAND, "--method", "qualitative", "--json", "out.json"]) == 0
     assert os.fsencode(json.loads(Path("out.json").read_text())["trials"][0]["file"]) == os.fsencode(odd)
-    assert "\x1b" not in capsys.readouterr().out
-    assert main(["segment", odd.replace("31", "32"), *HAND]) == 2
+    assert "\x1b" not in capsys.readouterr().out and main(["segment", odd.replace("31", "32"), *HAND]) == 2
     assert "\x1b" not in capsys.readouterr().err
     longest = "a" * 250 + ".json"
     assert main(["decompose", "task.toml", "--json", longest]) == 0 and Path(longest).exists()
@@ -224,17 +212,15 @@ def test_names_may_hold_what_a_file_system_allows(lab, capsys):
 
 def test_without_a_temporary_folder_a_line_says_so(lab, monkeypatch, capsys):
     monkeypatch.setattr(tempfile, "tempdir", str(lab / "nowhere"))
-    assert main(COMMANDS["decompose"]) == 2
-    assert "temporary files: cannot be used" in capsys.readouterr().err
+    assert main(COMMANDS["decompose"]) == 2 and "temporary files: cannot be used" in capsys.readouterr().err
 
 
 def test_nothing_is_written_into_the_package_and_no_home_is_needed(lab, monkeypatch):
     packages = [Path(sys.modules[n].__file__).parent for n in ("hmmseg", "hmmseg_cli")]
 
     def content():
-        return {
-            p: p.stat().st_mtime_ns for f in packages for p in f.rglob("*") if "__pycache__" not in str(p)
-        }
+        return {p: p.stat().st_mtime_ns for f in packages for p in f.rglob("*")
+                if "__pycache__" not in str(p)}  # fmt: skip
 
     before = content()
     monkeypatch.setenv("HOME", "/proc/nowhere")
@@ -262,18 +248,12 @@ def test_a_page_watched_in_the_terminal_leaves_standard_output_alone(lab):
     assert len(lines) == len(rows) and lines[-1]["final"]
 
 
-MOVES = 'objects = {a = {on = "ground"}}\nmoves = [' + '{object = "a", to = "ground"},' * 20_000 + "]"
-STATES = "sequence = [" + ", ".join(f'"s{i}"' for i in range(9000)) + "]"
-COLUMNS = "t" + "".join(f",c{i}" for i in range(300_000)) + "\n0\n"
-LIMITS = [
+@pytest.mark.parametrize(("name", "text", "line"), [
     ("task.toml", MOVES, "moves: 20000 moves, repeat 1; expected 2000 moves in all at most"),
     ("task.toml", STATES, "sequence: 9000 states; expected 2000 at most"),
     ("trial.csv", COLUMNS, "has 300001 columns; expected 20000"),
     ("trial.csv", "t," + "x" * 10_000_000, "row 1: is longer than 10000000 bytes"),
-]
-
-
-@pytest.mark.parametrize(("name", "text", "line"), LIMITS)
+])  # fmt: skip
 def test_what_nobody_means_is_refused_before_anything_is_made_of_it(name, text, line, lab, capsys):
     (lab / name).write_text(text)
     began = time.process_time()
@@ -331,8 +311,7 @@ def test_ctrl_c_at_any_moment(name, lab, capsys):
                     signal.setitimer(signal.ITIMER_REAL, 0)
             except KeyboardInterrupt:  # before or after the command itself
                 code = 130
-            assert code in (0, 130)
-            assert files(lab).keys() in (before.keys(), whole.keys())
+            assert code in (0, 130) and files(lab).keys() in (before.keys(), whole.keys())
     finally:
         signal.signal(signal.SIGALRM, usual)
     assert "Traceback" not in capsys.readouterr().err
@@ -374,10 +353,9 @@ sys.meta_path.insert(0, Interrupted)
 
 def sent(command, moment, stdin=None):
     """Standard output and error of a process that gets Ctrl-C after so many seconds, and its exit code."""
-    process = subprocess.Popen(
-        [*PROCESS, *command], stdin=stdin or subprocess.DEVNULL, stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE, start_new_session=True,
-    )  # fmt: skip
+    process = subprocess.Popen([*PROCESS, *command], stdin=stdin or subprocess.DEVNULL,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                               start_new_session=True)  # fmt: skip
     try:
         process.wait(moment)
     except subprocess.TimeoutExpired:

@@ -70,8 +70,7 @@ def test_a_replay_predicts_the_recording_s_forces(tmp_path, inputs):
     assert main([*args, "--replay", str(made / "trial_01.csv"), "--output", str(out), "--json", str(report),
                  "--figures", str(tmp_path / "figures")]) == 0  # fmt: skip
     rest = json.loads(report.read_text())["replay"]["net_force_residual_over_noise"]
-    assert rest["free-motion"] < 1.5
-    assert rest["hold-above-ground"] < 1.5
+    assert rest["free-motion"] < 1.5 and rest["hold-above-ground"] < 1.5
     rig = read_rig(out / "rig.toml")
     recorded, predicted = (read_trial(folder / "trial_01.csv", rig) for folder in (made, out))
     assert (recorded.channels["q11"] == predicted.channels["q11"]).all()
@@ -88,8 +87,7 @@ def test_what_is_refused_writes_nothing(tmp_path, inputs, more, message, monkeyp
     monkeypatch.chdir(tmp_path)
     (tmp_path / "operator.toml").write_text("gripp = 2.0\n")
     before = sorted(tmp_path.iterdir())
-    assert main(["simulate", *inputs, *more]) == 2
-    assert message in capsys.readouterr().err
+    assert main(["simulate", *inputs, *more]) == 2 and message in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before
 
 

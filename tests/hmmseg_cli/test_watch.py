@@ -55,8 +55,7 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
 ])  # fmt: skip
 def test_bad_input_gets_one_line(run, change, message):
     code, _, err = run(change(ROWS[:10]))
-    assert code == 2
-    assert len(err.splitlines()) == 1 and message in err
+    assert code == 2 and len(err.splitlines()) == 1 and message in err
 
 
 def test_angles_in_degrees_are_refused_as_in_a_file(run):
@@ -106,8 +105,7 @@ def test_a_rig_without_pads_is_told(run, tmp_path, left_out):
 def test_bad_rows_can_be_left_out(run):
     rows = [*ROWS[:5], "garbage", *ROWS[5:20]]
     code, lines, err = run(rows, "--skip-bad-rows")
-    assert code == 0 and len(lines) == 20
-    assert "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
+    assert code == 0 and len(lines) == 20 and "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
 
 
 def test_a_stream_that_ends_in_the_middle_of_a_row(run):

@@ -32,6 +32,7 @@ from simgap.attribution.verdict import (
 )
 
 PLAIN = Background(np.zeros(1), np.zeros(1))  # noise exactly as stated
+SURE = 1e-12  # a p-value that leaves no doubt of a gap
 
 
 def rows_of(trials: int = 4, channels: int = 3, parts: int = 2, samples: int = 12) -> Rows:
@@ -140,8 +141,7 @@ def test_some_of_the_candidates_score_as_they_do_among_all():
 
 def test_the_bayes_factor_bounds_the_chance_of_an_alarm():
     values = np.array([statistic(forms(gap_of({}, seed=s))) for s in range(30)])
-    assert np.mean(np.exp(-np.maximum(values, 0)) < 0.05) <= 0.1
-    assert statistic(forms(gap_of({0: 3.0}))) > 20
+    assert np.mean(np.exp(-np.maximum(values, 0)) < 0.05) <= 0.1 and statistic(forms(gap_of({0: 3.0}))) > 20
     assert detected(1e3).p_value == 0.0 and detected(-2.0).p_value == 1.0
 
 
@@ -207,9 +207,8 @@ def test_one_effect_is_named_with_its_size_and_share():
     found = attribute(gap_of({1: 3.0}))
     assert found.verdict == "named" and found.causes == ("b",) and found.indistinguishable == ()
     value = found.effects["b"].parameters["b0"]
-    assert (
-        value.mean == pytest.approx(3.0, abs=4 * value.sd) and found.effects["b"].probability > 0.93 * RECORD
-    )
+    assert (value.mean == pytest.approx(3.0, abs=4 * value.sd)
+            and found.effects["b"].probability > 0.93 * RECORD)  # fmt: skip
     assert found.effects["b"].share > 0.8 and found.remainder.share < 0.1 and found.remainder.p_value > 0.05
     assert found.how_far is not None and found.how_far.fraction > 0.8
     assert sum(found.probabilities.values()) == pytest.approx(1.0)
@@ -293,8 +292,7 @@ def test_an_effect_that_cannot_act_on_these_recordings_is_not_taken():
 
 
 def test_a_cause_of_a_sliver_of_the_gap_leaves_it_unknown():
-    assert known(0.9) > 0.9
-    assert known(0.01) < 0.1
+    assert known(0.9) > 0.9 and known(0.01) < 0.1
     assert known(0.4) < 0.5 < known(0.6)  # the interface's larger part
 
 
@@ -302,8 +300,7 @@ def test_a_noise_stated_too_low_is_no_gap():
     gap = gap_of({}, seed=11)
     louder = Gap(gap.rows, 1.25 * gap.residual, gap.nuisance, gap.candidates)
     found = attribute(louder, heldout=False)
-    assert found.verdict == "none"
-    assert np.mean(list(found.noise.values())) == pytest.approx(1.25, abs=0.15)
+    assert found.verdict == "none" and np.mean(list(found.noise.values())) == pytest.approx(1.25, abs=0.15)
 
 
 def test_how_far_covers_what_was_planted():
@@ -348,8 +345,7 @@ def test_what_is_of_one_trial_takes_nothing_off_the_held_out_share():
 def test_causes_are_those_without_which_other_trials_are_predicted_worse():
     gap = gap_of({0: 4.0, 2: 3.0}, seed=4)
     held = Heldout.of(forms(gap), np.ones(3), range(4))
-    assert held is not None
-    assert _predicting(held, (0, 1, 2, 3)) == (0, 2)
+    assert held is not None and _predicting(held, (0, 1, 2, 3)) == (0, 2)
     assert held.gain((0, 2), (0,)) > 3 > held.gain((0, 1, 2), (0, 2))
 
 
@@ -360,8 +356,7 @@ def test_what_one_trial_alone_says_is_an_accident():
     for where, causes in ((own, (0,)), (np.ones_like(own), (0, 2))):
         more = 6.0 * push * where
         held = Heldout.of(forms(replace(gap, residual=gap.residual + more)), np.ones(3), range(4))
-        assert held is not None and held.gain((0, 2), (0,)) > 3
-        assert _predicting(held, (0, 2)) == causes
+        assert held is not None and held.gain((0, 2), (0,)) > 3 and _predicting(held, (0, 2)) == causes
 
 
 def test_what_helps_the_trials_it_was_found_in_alone_is_no_cause():
@@ -390,8 +385,7 @@ def test_a_cause_that_leaves_nothing_that_can_be_seen_is_known_however_little_it
         f, rng = forms(replace(gap, residual=gap.residual + more)), np.random.default_rng(0)
         others = Heldout.of(f, np.full(3, 9.0), (0,))
         found = _examined(f, (0,), sought(f), np.full(f.count.size, 9.0), rng, others)
-        assert found.causes == (0,)
-        assert (found.known > 0.5) == likely
+        assert found.causes == (0,) and (found.known > 0.5) == likely
 
 
 def test_the_level_of_the_noise_is_that_of_its_mean_square_in_small_groups_too():
@@ -437,9 +431,6 @@ def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
     # Parts that are off count for less, which leaves few: noise alone holds 11 of 60 with them, this 42.
     assert sum(held) >= (40 if wander else 50)
     assert sum(plain) < 20 if wander else np.median(widened) < 1
-
-
-SURE = 1e-12  # a p-value that leaves no doubt of a gap
 
 
 def test_what_changes_sign_between_trials_is_no_cause():
@@ -495,8 +486,7 @@ def test_a_small_cause_beside_a_large_one_is_needed_where_the_form_of_the_large_
     f = forms(replace(gap, candidates=(replace(large, form=form), *others)))
     both, alone = fitted(f, (0, 2)), fitted(f, (0,))
     speaks = both.score - fitted(f, ()).score
-    assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks
-    assert _needed(f, both, 2) == needed
+    assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks and _needed(f, both, 2) == needed
 
 
 def test_a_cause_has_the_parameters_that_it_has_without_what_its_set_can_spare():
@@ -506,8 +496,7 @@ def test_a_cause_has_the_parameters_that_it_has_without_what_its_set_can_spare()
     found, f = attribute(gap, heldout=False), forms(gap)
     assert found.models[0].effects == (0, 1) and found.causes == ("a",)
     alone, both = fitted(f, (0,)).x[-1], fitted(f, (0, 1)).x[1]
-    assert abs(alone - both) > 0.3
-    assert found.effects["a"].parameters["a0"].mean == pytest.approx(alone)
+    assert abs(alone - both) > 0.3 and found.effects["a"].parameters["a0"].mean == pytest.approx(alone)
 
 
 def test_at_the_alarm_level_a_gap_is_as_likely_as_none():
@@ -554,8 +543,7 @@ def test_an_effect_is_taken_as_linearised_beside_those_that_it_acts_with():
     f = forms(replace(gap, candidates=(a, b, c, d, after_a, *joint)))
     assert {e for e in _neighbours(f, (0, 4)) if len(e) == 3} == {(2, 5, 6), (0, 3, 4)}
     assert _linearised(f, [0, 1]) == (0, 4)  # beside `a`, and nothing that does not act
-    assert _linearised(f, [0, 1, 2]) == (2, 5, 6)
-    assert _linearised(f, [1]) == (1,)
+    assert _linearised(f, [0, 1, 2]) == (2, 5, 6) and _linearised(f, [1]) == (1,)
 
 
 def test_what_is_known_of_a_random_effect_from_elsewhere_no_form_imitates():
@@ -566,5 +554,4 @@ def test_what_is_known_of_a_random_effect_from_elsewhere_no_form_imitates():
     for evidence, kept in ((400.0, True), (0.0, False)):
         f = forms(replace(gap, candidates=(*gap.candidates, replace(lattice, evidence=evidence))))
         others = Heldout.of(f, np.ones(3), (0, 4))
-        assert others is not None
-        assert (4 in _predicting(others, (0, 4))) == kept
+        assert others is not None and (4 in _predicting(others, (0, 4))) == kept

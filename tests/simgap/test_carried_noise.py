@@ -68,8 +68,7 @@ def test_products_of_noise_are_their_expectations():
     n, at = gap.residual.size, pad.at[0]
     with_residual, square = -GIVE * FORCE_SD**2 / variance * n, FORCE_SD**2 / variance * n
     # About `at`: d0'J stays, the constant part is at J - at J, and no curvature is taken off.
-    assert found[0, 0] == 0 and found[2, 2] == 0
-    assert found[0, 2] == pytest.approx(with_residual, rel=0.15)
+    assert found[0, 0] == 0 and found[2, 2] == 0 and found[0, 2] == pytest.approx(with_residual, rel=0.15)
     assert found[0, 1] == pytest.approx(0.0, abs=0.02 * n)
     assert found[1, 2] == pytest.approx(at * square, rel=0.15)
     assert found[1, 1] == pytest.approx(-(at**2) * square, rel=0.15)
@@ -105,9 +104,8 @@ def given():
 @double_precision
 def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_by(given):
     healthy = fit(given, (), neutral(given))
-    noise = carried(
-        healthy.residual[:, None], redrawn(given), lambda other: on_other(other, healthy).residual[:, None]
-    )
+    noise = carried(healthy.residual[:, None], redrawn(given),
+                    lambda other: on_other(other, healthy).residual[:, None])  # fmt: skip
     there, arrays = given.there, given.frame.arrays
     channel, doubted = np.nonzero(there)[2], (arrays.sd / arrays.plain)[there]
     square = np.square(noise[..., 0] * doubted).sum(0)
@@ -152,12 +150,10 @@ def test_rounding_shows_in_a_force_that_moves_and_not_in_one_that_rests_or_jumps
     force += 2e-3 * np.random.default_rng(0).standard_normal(force.shape)
     read = 0.05 * np.round(force / 0.05)
     step = rounding_step([read[:500], read[500:]])
-    assert step == pytest.approx(0.05, rel=1e-3)
-    assert rounding_step([force]) == 0.0
+    assert step == pytest.approx(0.05, rel=1e-3) and rounding_step([force]) == 0.0
     true, shown = read - force, rounding_error(read, step)
     left = np.std(true - shown, axis=0) / np.std(true, axis=0)
-    assert (left[:2] < 0.5).all()
-    assert np.abs(shown[:, 2:]).max() < 1e-9
+    assert (left[:2] < 0.5).all() and np.abs(shown[:, 2:]).max() < 1e-9
 
 
 @pytest.mark.parametrize("size", [0.3, 1.5, 8.0, 20.0])

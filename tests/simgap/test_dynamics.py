@@ -47,8 +47,7 @@ def test_a_spring_converges_at_second_order():
 
 def test_a_damped_spring_converges_at_first_order_or_better():
     errors = np.abs([oscillation(5e-4, h) for h in (2e-4, 1e-4, 5e-5)])
-    assert (np.log2(errors[:-1] / errors[1:]) > 0.9).all()
-    assert errors[-1] < 2e-6
+    assert (np.log2(errors[:-1] / errors[1:]) > 0.9).all() and errors[-1] < 2e-6
 
 
 @pytest.mark.parametrize("share", [0.5, 0.99])
@@ -77,9 +76,7 @@ def test_an_undamped_bounce_keeps_its_energy_as_the_step_shrinks():
         path = evolve(constants, at(constants, (0.0, 0.0085)), FAR, h, round(2.0 / h))
         held = jax.vmap(lambda s: energy(constants, s, FAR))(path)
         spread.append(float(jnp.ptp(held)) / (0.4 * 0.0005))  # over a hundred bounces
-    assert spread[0] < 0.05
-    assert spread[1] < spread[0] / 3
-    assert spread[2] < spread[1] / 3
+    assert spread[0] < 0.05 and spread[1] < spread[0] / 3 and spread[2] < spread[1] / 3
 
 
 def test_contact_never_makes_energy():
@@ -107,12 +104,10 @@ def test_blocks_that_meet_in_the_air_keep_their_momentum():
 def test_a_stack_stays_a_stack():
     blocks = [Block(0.3, 0.018, 0.016), Block(0.6, 0.025, 0.013), Block(0.4, 0.02, 0.018)]
     constants = scene(blocks)
-    path = evolve(
-        constants, at(constants, (0.003, 0.039), (0.0, 0.0245), (-0.002, 0.009)), FAR, 2.5e-4, 40000
-    )
+    path = evolve(constants, at(constants, (0.003, 0.039), (0.0, 0.0245), (-0.002, 0.009)), FAR, 2.5e-4,
+                  40000)  # fmt: skip
     for k in range(3):
-        assert float(jnp.ptp(path.x[k])) < 1e-12
-        assert float(jnp.ptp(path.y[k][8000:])) < 1e-10
+        assert float(jnp.ptp(path.x[k])) < 1e-12 and float(jnp.ptp(path.y[k][8000:])) < 1e-10
     assert float(path.y[0][-1]) == pytest.approx(0.039 - (1.3 + 0.9 + 0.3) / 1e5, abs=1e-8)
 
 
@@ -150,8 +145,7 @@ def test_gradients_through_contact_agree_with_differences():
     for k, value in enumerate(exact):
         h = 1e-7 * float(point[k])
         up, down = ([p + sign * h if k == j else p for j, p in enumerate(point)] for sign in (1.0, -1.0))
-        assert np.isfinite(value)
-        assert value != 0.0
+        assert np.isfinite(value) and value != 0.0
         assert float(value) == pytest.approx(float(loss(*up) - loss(*down)) / (2 * h), rel=1e-4)
 
 
@@ -168,9 +162,8 @@ def test_gradients_are_finite_exactly_at_touch():
         assert np.isfinite(value)
 
 
-@pytest.mark.parametrize(
-    ("depth", "rate", "force"), [(1e-3, 0.0, 4.0), (1e-3, 0.1, 4.8), (-1e-3, 5.0, 0.0), (1e-3, -5.0, 0.0)]
-)
+@pytest.mark.parametrize(("depth", "rate", "force"), [(1e-3, 0.0, 4.0), (1e-3, 0.1, 4.8), (-1e-3, 5.0, 0.0),
+                                                      (1e-3, -5.0, 0.0)])  # fmt: skip
 def test_a_spring_pushes_by_its_compression_and_never_pulls(depth, rate, force):
     found = normal_force(*map(jnp.asarray, (4000.0, 8.0, depth, rate)))
     assert float(found) == pytest.approx(force)

@@ -51,8 +51,7 @@ def test_no_force_before_the_contact_behind_a_low_pass():
         return 4.0 * np.maximum(at - onset, 0.0)
 
     found = np.asarray(contact(_slow(_recorded(force, 0.1, 60), 0.1)))[0, :, 0]
-    assert np.abs(found[:21]).max() < 0.02
-    assert np.abs(found - force(t))[24:-5].max() < 0.05
+    assert np.abs(found[:21]).max() < 0.02 and np.abs(found - force(t))[24:-5].max() < 0.05
 
 
 def test_a_corner_is_in_doubt_and_a_straight_force_is_not():
@@ -85,11 +84,9 @@ def test_values_at_their_own_samples_are_themselves():
 def test_a_late_force_is_in_doubt_where_it_is_read(steps):
     world = world_of(performance(600))
     force = np.where(np.arange(60) >= 30, 2.0, 0.0)
-    world = world._replace(
-        force=np.repeat(force[None, :, None], 4, axis=2),
-        delay=np.asarray(steps) * np.median(world.t[:, 1:] - world.t[:, :-1]),
-        modes=np.eye(6)[LATE],
-    )
+    world = world._replace(force=np.repeat(force[None, :, None], 4, axis=2),
+                           delay=np.asarray(steps) * np.median(world.t[:, 1:] - world.t[:, :-1]),
+                           modes=np.eye(6)[LATE])  # fmt: skip
     variance = np.asarray(doubt_between(world))[0, :, 0]
     assert variance.argmax() == 29 - int(steps)
     # It came at any moment between the two samples: at least the variance of one that came midway.
@@ -110,11 +107,9 @@ def test_a_support_settles_like_a_spring_beside_a_damper():
     world = world_of(performance(10 * n))
     t = np.arange(n) * STEP
     carry = ((t > 1.0) & (t < 2.0)).astype(float)
-    world = world._replace(
-        give_support=np.asarray(give), support_time=np.asarray(time), carry=np.asarray(carry)[None],
-        free=np.zeros((1, n)), ground=np.asarray(1 - carry)[None],
-        modes=np.eye(6)[YIELDING],
-    )  # fmt: skip
+    world = world._replace(give_support=np.asarray(give), support_time=np.asarray(time),
+                           carry=np.asarray(carry)[None], free=np.zeros((1, n)),
+                           ground=np.asarray(1 - carry)[None], modes=np.eye(6)[YIELDING])  # fmt: skip
     load = np.where(t >= 2.0, np.minimum(3.0 * (t - 2.0 + STEP), 0.8), 0.5)
     depth = np.asarray(sunk(world, np.asarray(load)[None]))[0]
     borne = load * (1 - carry)

@@ -17,12 +17,11 @@ def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares
     n = len(values)
     levers, pinned, place, jump = joints or (np.zeros((n, 4, 0)), np.zeros((n, 0)) > 0, np.zeros((n, 0)), 0.0)
     still = np.zeros((1, *place.shape))
-    return tracked(
-        values[None], np.broadcast_to(weight, (1, n, 4)) * 1.0, np.full((1, n, 4), sd), levers[None],
-        np.broadcast_to(np.reshape(walk, (-1, 1)), (1, n, 3)) * 1.0, np.broadcast_to(new, (1, n, 3)) > 0,
-        ANYWHERE**2, pinned[None], place[None], still, still + 1e-6,
-        np.full((1, place.shape[1]), jump), np.asarray(shares), np.asarray(chance),
-    )  # fmt: skip
+    return tracked(values[None], np.broadcast_to(weight, (1, n, 4)) * 1.0, np.full((1, n, 4), sd),
+                   levers[None], np.broadcast_to(np.reshape(walk, (-1, 1)), (1, n, 3)) * 1.0,
+                   np.broadcast_to(new, (1, n, 3)) > 0, ANYWHERE**2, pinned[None], place[None], still,
+                   still + 1e-6, np.full((1, place.shape[1]), jump), np.asarray(shares),
+                   np.asarray(chance))  # fmt: skip
 
 
 def _cost(found, sd, channel) -> float:
@@ -71,15 +70,13 @@ def test_a_joint_lies_where_it_was_pushed_to():
     # An encoder's speeds say nothing of the dead band.
     band = within(world._replace(rates=np.gradient(recorded, t, axis=0)[None]), half, 1.0)
     off, pinned = (((true - recorded) - band.place[0]) / half)[inner], band.pinned[0, inner]
-    assert pinned.mean() > 0.6
-    assert np.sqrt(np.mean(off[pinned] ** 2)) < 0.15
+    assert pinned.mean() > 0.6 and np.sqrt(np.mean(off[pinned] ** 2)) < 0.15
     assert np.abs(off[~pinned]).max() < 2.2 and (band.jump > 0).all() and not band.wander.any()
     # A tachometer's say how the joint crosses it.
     rates = np.gradient(true, t, axis=0) + 2e-3 * rng.standard_normal(true.shape)
     band = within(world._replace(rates=rates[None]), half, 0.0)
     off = (((true - recorded) - band.place[0]) / half)[inner]
-    assert np.sqrt(np.mean(off**2)) < 0.15
-    assert not band.jump.any() and (band.wander > 0).all()
+    assert np.sqrt(np.mean(off**2)) < 0.15 and not band.jump.any() and (band.wander > 0).all()
 
 
 def test_joints_in_dead_bands_are_marginalised_exactly():

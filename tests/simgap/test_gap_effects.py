@@ -17,13 +17,9 @@ quantisation joint_offset link_length backlash clock_jitter fingertip_compliance
 fingertip_mass grip_slip object_inertia offcentre_mass table_tilt table_compliance cable_force
 viscous_drag structural_vibration contact_impact hand_roll actual
 """
-RIG = Rig(
-    fingers={
-        "1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
-        "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12)),
-    },
-    fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0),
-)
+RIG = Rig(fingers={"1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
+                   "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12))},
+          fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))  # fmt: skip
 DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
 
 
@@ -48,16 +44,15 @@ def world_of(p: Performance) -> World:
     held = (p.t[k] > 1.0).astype(float)
     carry = ((p.t[k] > 1.2) & (p.t[k] < 1.6)).astype(float)
     one, zero = np.ones(()), np.zeros(())
-    return World(
-        t=p.t[k][None], joints=joints[None], rates=rates[None], force=flat(p)[k][None],
-        load=np.zeros((1, held.size, 4)), base=np.array([0.05, 0.17, 0.21, 0.17]), length=np.full(4, 0.12),
-        jointed=one, gravity=9.81 * one, link=np.ones(4), give_normal=np.full(2, 1 / 4000),
-        give_shear=np.full(2, 1 / 2500), delay=np.zeros(4), smoothing=np.zeros(4), creep=zero, creep_time=one,
-        tilt=zero, give_support=zero, support_time=zero, inertia=one, couple=zero,
-        loudness=np.ones((1, held.size, 4)), ring=np.array([1.0, 0.05, 0.0]), slip=np.zeros((1, held.size)),
-        modes=np.zeros(6), free=1 - held[None], ground=(held - carry)[None], carry=carry[None],
-        events=p.events[None],
-    )  # fmt: skip
+    return World(t=p.t[k][None], joints=joints[None], rates=rates[None], force=flat(p)[k][None],
+                 load=np.zeros((1, held.size, 4)), base=np.array([0.05, 0.17, 0.21, 0.17]),
+                 length=np.full(4, 0.12), jointed=one, gravity=9.81 * one, link=np.ones(4),
+                 give_normal=np.full(2, 1 / 4000), give_shear=np.full(2, 1 / 2500), delay=np.zeros(4),
+                 smoothing=np.zeros(4), creep=zero, creep_time=one, tilt=zero, give_support=zero,
+                 support_time=zero, inertia=one, couple=zero, loudness=np.ones((1, held.size, 4)),
+                 ring=np.array([1.0, 0.05, 0.0]), slip=np.zeros((1, held.size)), modes=np.zeros(6),
+                 free=1 - held[None], ground=(held - carry)[None], carry=carry[None],
+                 events=p.events[None])  # fmt: skip
 
 
 def test_every_name_of_the_contract_is_an_effect():
@@ -75,21 +70,15 @@ def test_an_effect_that_is_off_changes_nothing_and_is_finite_where_a_fit_begins(
         start = {p.name: p.starts[which] if p.starts else p.nominal for p in effect.parameters.values()}
         steps = [{**start, p.name: p.value(p.coordinate(start[p.name]) + STEP)}
                  for p in effect.parameters.values()]  # fmt: skip
-        assert all(
-            np.isfinite(z).all() for v in (start, *steps) for z in tree_leaves(effect.correct(world, v, 1.0))
-        )
+        assert all(np.isfinite(z).all() for v in (start, *steps)
+                   for z in tree_leaves(effect.correct(world, v, 1.0)))  # fmt: skip
 
 
-PLANTED = {
-    "force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
-    "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
-    "force_gain": {"gain": 0.08},
-    "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
-    "sensor_rotation": {"angle1": 0.05, "angle2": -0.04},
-    "viscous_drag": {"coefficient": 0.7},
-    "fingertip_mass": {"mass": 0.012},
-    "contact_impact": {"impulse": 0.02},
-}
+PLANTED = {"force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
+           "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
+           "force_gain": {"gain": 0.08}, "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
+           "sensor_rotation": {"angle1": 0.05, "angle2": -0.04}, "viscous_drag": {"coefficient": 0.7},
+           "fingertip_mass": {"mass": 0.012}, "contact_impact": {"impulse": 0.02}}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(PLANTED))

@@ -75,10 +75,8 @@ def test_a_clocks_errors_move_residuals_by_their_unit(fast):
         assert np.quantile(ratio, [0.1, 0.5, 0.9]) == pytest.approx([0.87, 1.0, 1.13], abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("channel", "phase", "most"),
-    [("vx", 0, 1.3), ("vy", 0, 1.3), ("vx", 2, 1.3), ("vy", 2, 1.3), ("fy", 2, 1.8)],
-)
+@pytest.mark.parametrize(("channel", "phase", "most"), [("vx", 0, 1.3), ("vy", 0, 1.3), ("vx", 2, 1.3),
+                                                        ("vy", 2, 1.3), ("fy", 2, 1.8)])  # fmt: skip
 def test_fast_work_leaves_little_but_noise_away_from_contact_changes(fast, channel, phase, most):
     # Differences without their doubt leave 1.4 to 2.1 here, accelerations from three samples 2.5. Beside a
     # touchdown much more is left still (docs/gap.md).
@@ -150,8 +148,7 @@ def test_noise_and_smooth_motion_have_no_kinks():
 def test_what_fingers_push_does_not_rest():
     place = np.where(np.arange(40) < 20, 0.0, 2e-3)
     push = changes(place, np.full(40, 2e-5))
-    assert push[19] == push[20] == pytest.approx(2e-3, rel=0.05)
-    assert np.count_nonzero(push) == 2
+    assert push[19] == push[20] == pytest.approx(2e-3, rel=0.05) and np.count_nonzero(push) == 2
 
 
 def test_speeds_say_nothing_where_a_finger_touches():

@@ -109,9 +109,8 @@ def test_a_scatter_is_as_large_as_it_was_before_nuisances_took_of_it(healthy):
     variance = np.where(rows.channel == CHANNELS.index("offset"), 9.0, 0.0)
     columns = cosines(rows, given.nuisances.columns)[0]
     drawn = np.sqrt(variance)[:, None] * rng.standard_normal((variance.size, 400))
-    left = drawn - columns @ np.linalg.solve(
-        np.eye(columns.shape[1]) + columns.T @ columns, columns.T @ drawn
-    )
+    left = drawn - columns @ np.linalg.solve(np.eye(columns.shape[1]) + columns.T @ columns,
+                                             columns.T @ drawn)  # fmt: skip
     mine, kept = variance > 0, given.nuisances.kept(rows, variance)
     assert kept[mine].sum() == pytest.approx(np.square(left[mine]).mean(1).sum(), rel=0.02)
     assert kept[mine].min() < 0.9 * 9.0 and (kept[~mine] == 0).all()
@@ -145,10 +144,8 @@ def test_quantisation_is_seen_and_not_imagined(healthy):
 @pytest.mark.parametrize("broken", [1, 2])
 def test_a_trial_without_one_of_its_channels_is_left_out(broken):
     trials, task, rig = recorded("none_1", 2)
-    mute = [
-        replace(t, channels=t.channels | {"q12": np.full(t.t.size, np.nan)}) if k < broken else t
-        for k, t in enumerate(trials)
-    ]
+    mute = [replace(t, channels=t.channels | {"q12": np.full(t.t.size, np.nan)}) if k < broken else t
+            for k, t in enumerate(trials)]  # fmt: skip
     aligned = align(mute, task, rig)
     assert [t.segmentation.complete for t in aligned.trials] == [False] * broken + [True] * (2 - broken)
     if broken == 2:

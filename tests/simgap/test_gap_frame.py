@@ -16,6 +16,9 @@ from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block
 from simgap.world.simulate import SimulatedTrial, simulate_trials
 
+BLOCKS = {name: Block(0.5, 0.02 + 0.004 * k, 0.018, 0.7) for k, name in enumerate(TASK.objects)}
+FORCES = ("fx1", "fy1", "fx2", "fy2")
+
 
 def test_blocks_are_those_that_were_recorded_whatever_was_measured():
     alone = simulated.blocks_of(search(align(TRIALS, TASK, RIG)))
@@ -25,10 +28,6 @@ def test_blocks_are_those_that_were_recorded_whatever_was_measured():
     assert told["block2"].width == pytest.approx(alone["block2"].width, abs=1e-4)
     assert simulated.measured_on(told, wrong) == {"block1": {"height": (told["block1"].height, 1e-4)}}
     assert simulated.measured_on(told, None) is None
-
-
-BLOCKS = {name: Block(0.5, 0.02 + 0.004 * k, 0.018, 0.7) for k, name in enumerate(TASK.objects)}
-FORCES = ("fx1", "fy1", "fx2", "fy2")
 
 
 @pytest.fixture(scope="module")

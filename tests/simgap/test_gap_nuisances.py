@@ -38,8 +38,7 @@ def test_level_and_colour_are_found_beside_a_loud_stretch(level, colour):
     square = level**2 * _density(turn, colour) * rng.standard_normal(turn.size) ** 2
     square[turn < 0.3] *= 50.0  # an effect: slow and large
     found = _likeliest(turn, square)
-    assert found[0] == pytest.approx(level, rel=0.08)
-    assert found[1] == pytest.approx(colour, abs=0.08)
+    assert found[0] == pytest.approx(level, rel=0.08) and found[1] == pytest.approx(colour, abs=0.08)
 
 
 @pytest.fixture(scope="module")
@@ -82,16 +81,9 @@ def test_a_lifted_block_turns_until_its_moments_balance(given, off):
     force = np.array([[[grip, (weight - lift) / 2, -grip, (weight + lift) / 2]]])
     world = given.frame.world._replace(couple=np.asarray(off), carry=np.ones((1, 1)))
     one = np.ones((1, 1))
-    found, rise, ease = turned(
-        world,
-        weight * one,
-        width * one,
-        np.array([0.3, 0.7]) * compliance,
-        force,
-        one * (heights + width * turn),
-    )
-    assert found[0, 0] == pytest.approx(turn)
-    assert rise[0, 0] == 0.0
+    found, rise, ease = turned(world, weight * one, width * one, np.array([0.3, 0.7]) * compliance, force,
+                               one * (heights + width * turn))  # fmt: skip
+    assert found[0, 0] == pytest.approx(turn) and rise[0, 0] == 0.0
     assert ease[0, 0] == pytest.approx(compliance)
 
 
@@ -211,16 +203,14 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
     world, arrays = given.frame.world, given.frame.arrays
     tilted = catalogue()["table_tilt"].correct(world, {"angle": 0.02, "turned": 0.8}, 1.0)
     offset, width = CHANNELS.index("offset"), arrays.onehot @ (arrays.objects @ given.centre[:, 1])
-    change = [
-        residuals(w, arrays, given.centre, np.zeros(2), given.noise)[0][..., offset] for w in (world, tilted)
-    ]
+    change = [residuals(w, arrays, given.centre, np.zeros(2), given.noise)[0][..., offset]
+              for w in (world, tilted)]  # fmt: skip
     change = (change[1] - change[0])[0] * (arrays.there[0, :, offset] > 0)
     held, move = arrays.onehot[0, :, 0] > 0, width[0][arrays.onehot[0, :, 0] > 0][0]
     there = held & (arrays.there[0, :, offset] > 0)
     # Predictions from the samples before miss it once, at the first that is in the air.
     first = np.flatnonzero(there & (arrays.phase[0, :, Phase.CARRY] > 0))[0]
-    assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05)
-    assert np.abs(change[:first]).max() < 1e-9
+    assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05) and np.abs(change[:first]).max() < 1e-9
 
 
 def test_a_finger_that_still_presses_harder_is_no_gap_and_forces_in_balance_may_be_one():

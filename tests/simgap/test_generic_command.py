@@ -78,8 +78,7 @@ def test_a_plain_task_without_simulated_trials_is_refused(folder, capsys):
 def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypatch, more, line):
     monkeypatch.chdir(folder)
     (folder / "actual.toml").write_text("")
-    assert main(arguments(folder, *more)) == 2
-    assert line in capsys.readouterr().err
+    assert main(arguments(folder, *more)) == 2 and line in capsys.readouterr().err
 
 
 def test_trials_as_simulate_writes_them_go_with_recordings_of_other_columns(tmp_path, monkeypatch):
@@ -109,11 +108,8 @@ def test_a_bias_is_named_with_figures_and_page(folder):
     assert (document["verdict"], document["causes"]) == ("named", ["force_bias"])
     assert document["effects"]["force_bias"]["parameters"]["fa"]["mean"] == pytest.approx(1.0, abs=0.1)
     assert document["effects"]["force_bias"]["parameters"]["fa"]["unit"] == "unit of fa"
-    assert {row["channel"] for row in document["where"]} == {"fa"}
-    assert document["shrinkage"]["fraction"] > 0.9
-    assert all(
-        (folder / "f" / f"gap_{n}.png").stat().st_size > 5000 for n in ("where", "signal", "before_after")
-    )
+    assert {row["channel"] for row in document["where"]} == {"fa"} and document["shrinkage"]["fraction"] > 0.9
+    assert all((folder / "f" / f"gap_{n}.png").stat().st_size > 5000
+               for n in ("where", "signal", "before_after"))  # fmt: skip
     page = (folder / "p.html").read_text()
-    assert 'id="verdict"' in page and "force_bias" in page
-    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    assert 'id="verdict"' in page and "force_bias" in page and not re.search(r"(src|href)=\"(?!data:)", page)

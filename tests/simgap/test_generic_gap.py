@@ -53,8 +53,7 @@ def test_parts_cover_a_subtask_and_follow_its_event_in_seconds(alike):
 
 def test_every_feature_belongs_to_one_channel_or_is_a_duration(alike):
     found = np.concatenate([alike.of_channel(c) for c in (0, 1, -1)])
-    assert sorted(found) == list(range(alike.kind.size))
-    assert np.isfinite(np.concatenate(both(alike))).all()
+    assert sorted(found) == list(range(alike.kind.size)) and np.isfinite(np.concatenate(both(alike))).all()
 
 
 def test_whitened_rows_of_alike_trials_have_the_squares_that_are_stated():
@@ -72,8 +71,7 @@ def test_whitened_rows_of_alike_trials_have_the_squares_that_are_stated():
 def test_sub_bands_cover_the_spectrum_without_gaps(window):
     found = _sub_bands(6, window)
     assert found[0].start == 6 and found[-1].stop == window
-    assert all(a.stop == b.start for a, b in pairwise(found))
-    assert min(s.stop - s.start for s in found) >= 3
+    assert all(a.stop == b.start for a, b in pairwise(found)) and min(s.stop - s.start for s in found) >= 3
     assert _sub_bands(6, 8) == ()
 
 
@@ -125,8 +123,7 @@ def test_a_ring_is_recovered_with_its_interval():
         wave = size * np.exp(-0.06 * 2 * np.pi * 7.4 * t) * np.sin(2 * np.pi * 7.4 * t + phase)
         rings.append(wave + 0.3 * t - 0.1 * t**2 + 0.02 * rng.standard_normal(t.size))
     found = fit_ring(from_swing(rings), 200.0)
-    assert found is not None
-    assert found.frequency_90[0] < 7.4 < found.frequency_90[1]
+    assert found is not None and found.frequency_90[0] < 7.4 < found.frequency_90[1]
     assert found.damping_90[0] < 0.06 < found.damping_90[1]
     assert found.frequency_90[1] - found.frequency_90[0] < 0.1
     assert fit_ring(np.tile(np.exp(-3 * t), (4, 1)), 200.0) is None  # a course is no ring
@@ -141,8 +138,7 @@ def test_alike_ensembles_are_called_alike():
 def test_a_planted_effect_is_named_with_its_parameters(name):
     real, sim, boundaries = made(5, {name: PLANTED[name]})
     body = diagnose(align(real, sim, TASK, boundaries=boundaries)).body
-    assert body["verdict"] in ("named", "set")
-    assert name in {*body["causes"], *body["indistinguishable"]}
+    assert body["verdict"] in ("named", "set") and name in {*body["causes"], *body["indistinguishable"]}
     assert sum(body["probabilities"].values()) == pytest.approx(1.0)
     best = body["effects"]["+".join(body["causes"])]["parameters"]
     prefix = f"{name}." if len(body["causes"]) > 1 else ""
@@ -153,8 +149,7 @@ def test_a_planted_effect_is_named_with_its_parameters(name):
         p = best[prefix + key]
         low, high = p["interval_90"]
         wide = 2 * (high - low)
-        assert low - wide < true < high + wide
-        assert p["mean"] == pytest.approx(true, rel=0.25)
+        assert low - wide < true < high + wide and p["mean"] == pytest.approx(true, rel=0.25)
     assert body["shrinkage"]["fraction"] > 0.5
     assert {row["channel"] for row in body["where"]} <= {"fa", "fb", "duration"}
     assert sum(row["share"] for row in body["where"]) == pytest.approx(1.0)
@@ -178,8 +173,7 @@ def test_an_effect_can_be_forced_and_an_unknown_one_is_refused():
 def test_one_real_trial_says_that_it_is_weaker():
     real, sim, boundaries = made(4, {"force_bias": {"value": 1.0}})
     found = diagnose(align(real[:1], sim, TASK, boundaries=boundaries))
-    assert any("nothing is held out" in w for w in found.warnings)
-    assert "force_bias" in found.leading
+    assert any("nothing is held out" in w for w in found.warnings) and "force_bias" in found.leading
 
 
 def test_trials_that_do_not_go_together_are_refused():
@@ -228,5 +222,4 @@ def test_the_hmm_finds_the_subtasks_by_itself():
     given = align(real, sim, TASK)
     # Without labels a boundary may settle anywhere in the course, but in all trials of both kinds alike.
     late = [cut.edges[1] - boundaries[cut.trial.file][0] for cut in (*given.real, *given.sim)]
-    assert np.std(late) < 0.1
-    assert "force_bias" in diagnose(given).body["causes"]
+    assert np.std(late) < 0.1 and "force_bias" in diagnose(given).body["causes"]

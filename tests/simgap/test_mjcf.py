@@ -41,6 +41,12 @@ noise = 1e-4
 actuator = "m"
 unit = "Nm"
 """
+TURN = '[columns.q]\njoint = "turn"\nnoise = 1e-4\n[columns.u]\nactuator = "servo"\nunit = "rad"\n'
+SET = ("joint:turn.damping", "joint:turn.armature", "body:arm.mass", "body:arm.com_x", "body:arm.payload",
+       "actuator:servo.gain", "actuator:servo.damping", "option.tilt_x", "option.timestep",
+       "joint:nod.tie")  # fmt: skip
+TIE = """<body name="head" pos="1 0 0"><joint name="nod" axis="0 0 1"/><geom size="0.02" mass="0.1"/></body>
+  </worldbody><equality><joint joint1="nod" joint2="turn"/></equality>"""
 
 
 @pytest.fixture
@@ -83,9 +89,8 @@ def test_a_window_is_the_linear_pendulum(files, share):
     inertia = 0.5 * 0.2**2 + 0.4 * 0.5 * 0.01**2
     omega = np.sqrt((1 - share) * 0.5 * 9.81 * 0.2 / inertia)
     t = window.t - window.t[0]
-    np.testing.assert_allclose(
-        channels["q"], 1e-3 * np.cos(omega * t) - 2e-3 / omega * np.sin(omega * t), atol=2e-8
-    )
+    np.testing.assert_allclose(channels["q"], 1e-3 * np.cos(omega * t) - 2e-3 / omega * np.sin(omega * t),
+                               atol=2e-8)  # fmt: skip
 
 
 def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
@@ -198,8 +203,7 @@ def test_what_a_slide_s_actuator_gives_is_a_force(files, kind, units):
     xml = XML.replace('<motor name="m" joint="pivot"/>', servo).replace('axis="0 1 0"', f'type="{kind}"')
     model = load_mjcf(*files(xml, f'{MAP}[columns.f]\nactuator = "m"\nkind = "force"')).simulator
     found = [model.channels["f"].unit, setting_of(model.model, "actuator:m.limit").unit]
-    assert found == units
-    assert setting_of(model.model, "actuator:m.damping").unit.startswith(f"{units[0]} s")
+    assert found == units and setting_of(model.model, "actuator:m.damping").unit.startswith(f"{units[0]} s")
 
 
 @pytest.mark.parametrize(("unit", "si"), [("deg", "rad"), ("mNm", "Nm"), ("%", "1"), ("V", "1")])
@@ -284,14 +288,6 @@ SERVO = """<mujoco>
   <actuator><position name="servo" joint="turn" kp="40" kv="2"/></actuator>
 </mujoco>
 """
-TURN = '[columns.q]\njoint = "turn"\nnoise = 1e-4\n[columns.u]\nactuator = "servo"\nunit = "rad"\n'
-
-
-SET = ("joint:turn.damping", "joint:turn.armature", "body:arm.mass", "body:arm.com_x", "body:arm.payload",
-       "actuator:servo.gain", "actuator:servo.damping", "option.tilt_x", "option.timestep",
-       "joint:nod.tie")  # fmt: skip
-TIE = """<body name="head" pos="1 0 0"><joint name="nod" axis="0 0 1"/><geom size="0.02" mass="0.1"/></body>
-  </worldbody><equality><joint joint1="nod" joint2="turn"/></equality>"""
 
 
 @pytest.mark.parametrize("name", SET)
@@ -375,9 +371,8 @@ def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
         asked.append(float(data.qpos[0]))
         data.ctrl[:] = np.interp(k * h, t, 0.3 * np.sin(6 * t))
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(
-        run(option__hold=1.0), np.interp(t, h * np.arange(len(asked)), asked), atol=1e-5
-    )
+    np.testing.assert_allclose(run(option__hold=1.0), np.interp(t, h * np.arange(len(asked)), asked),
+                               atol=1e-5)  # fmt: skip
     assert np.abs(run(option__hold=1.0, option__late=0.5) - run(option__hold=1.0)).max() > 1e-4
 
 
@@ -410,9 +405,8 @@ def test_joints_without_a_column_follow_their_equality(files, seen):
     found = load_mjcf(*files(FINGERS, f'[columns.w]\njoint = "{seen}"\n'))
     t, (left, right) = np.arange(0, 1, 0.01), (0.02, 0.05)
     start = {"left": (left, 0.1), "right": (right, 0.2)}[seen]
-    job = Job(
-        {}, Recording("a.csv", t, {"w": np.zeros(t.size)}), dict(zip(("w", "w_rate"), start, strict=True))
-    )
+    job = Job({}, Recording("a.csv", t, {"w": np.zeros(t.size)}),
+              dict(zip(("w", "w_rate"), start, strict=True)))  # fmt: skip
     _, *state = found.simulator._states([job])[0]
     np.testing.assert_allclose(state, [left, right, 3 * right**2, 0.1, 0.2, 6 * right * 0.2])
     assert not found.warnings
@@ -542,10 +536,8 @@ def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, 
         + '</worldbody><equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality>'
         '<actuator><position name="grip" joint="left" kp="400" kv="10"/></actuator></mujoco>'
     )  # fmt: skip
-    described = (
-        '[columns.l]\njoint = "left"\n[columns.r]\njoint = "right"\n'
-        '[columns.u]\nactuator = "grip"\nunit = "m"\n'
-    )
+    described = ('[columns.l]\njoint = "left"\n[columns.r]\njoint = "right"\n'
+                 '[columns.u]\nactuator = "grip"\nunit = "m"\n')  # fmt: skip
     found, t = load_mjcf(*files(xml, described)), np.arange(0, 0.5, 0.001)
     log = Recording("a.csv", t, {"l": 0 * t, "r": 0 * t, "u": 0.02 * np.sin(9 * t)})
     found.effects([log])
@@ -624,8 +616,7 @@ def test_no_play_is_the_plain_model_and_play_lags_at_turns(files):
     plain = run()
     assert np.abs(run(joint_of_turn__width=1e-7) - plain).max() < 1e-3
     apart = run(joint_of_turn__width=0.02) - plain
-    assert 3e-3 < np.abs(apart).max() < 0.06
-    assert np.abs(run() - plain).max() == 0.0
+    assert 3e-3 < np.abs(apart).max() < 0.06 and np.abs(run() - plain).max() == 0.0
 
 
 def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(files):

@@ -53,10 +53,8 @@ def test_a_diagnosis_takes_an_identification_with_its_alignment(monkeypatch):
         patched.setattr("simgap.gap.search.identify_aligned", never)
         told = diagnose(found)
     assert told.body["verdict"] == "none"
-    np.testing.assert_array_equal(
-        [a.quantile(0.5) for a in told.search.aligned.trials[0].boundaries],
-        [a.quantile(0.5) for a in found.aligned.trials[0].boundaries],
-    )
+    np.testing.assert_array_equal([a.quantile(0.5) for a in told.search.aligned.trials[0].boundaries],
+                                  [a.quantile(0.5) for a in found.aligned.trials[0].boundaries])  # fmt: skip
     # An effect that is never chosen is taken where asked for, healthy recordings of one's own are the null,
     # and the document has the properties that were identified, and shifts them from there.
     effects = diagnose(found, effects=("object_inertia",), healthy=found.aligned).body["effects"]

@@ -33,6 +33,7 @@ force = 0.012
 """
 SOFT = {"normal_stiffness": (1500.0, "N/m"), "shear_stiffness": (900.0, "N/m")}
 BIAS = {"fx1": (0.15, "N"), "fy1": (-0.1, "N"), "fx2": (0.05, "N"), "fy2": (0.2, "N")}
+OFFSETS = {"q11": (0.01, "rad"), "q12": (0.0, "rad"), "q21": (-0.008, "rad"), "q22": (0.004, "rad")}
 
 
 def found(effects: dict[str, dict[str, tuple[float, str]]]) -> dict:
@@ -61,10 +62,9 @@ def test_the_rig_keeps_its_text_and_says_what_was_found():
     assert rig.fingertip.normal_stiffness == 1500.0
     assert rig.effects == {"force_bias": {k: v for k, (v, _) in BIAS.items()}}
     ranges = json.loads(written["ranges.json"])["parameters"]
-    assert ranges["effects.force_bias.fy2"] == {
-        "unit": "N", "mean": 0.2, "sd": 0.004, "low": pytest.approx(0.1933, abs=1e-4),
-        "high": pytest.approx(0.2067, abs=1e-4),
-    }  # fmt: skip
+    assert ranges["effects.force_bias.fy2"] == {"unit": "N", "mean": 0.2, "sd": 0.004,
+                                                "low": pytest.approx(0.1933, abs=1e-4),
+                                                "high": pytest.approx(0.2067, abs=1e-4)}  # fmt: skip
     assert ranges["fingertip.normal_stiffness"]["mean"] == 1500.0
     assert tomllib.loads(written["actual.toml"])["block1"]["width"]["value"] == BLOCKS["block1"].width
 
@@ -81,14 +81,10 @@ def test_links_are_corrected_in_place_and_nothing_is_written_without_a_cause():
         checked({"gravity_wave": {"size": 1.0}}, "rig.toml")
 
 
-OFFSETS = {"q11": (0.01, "rad"), "q12": (0.0, "rad"), "q21": (-0.008, "rad"), "q22": (0.004, "rad")}
-PLANTED = [
+@pytest.mark.parametrize("effects", [
     {"fingertip_compliance": SOFT, "force_bias": BIAS},
     {"force_lag": {"delay": (0.15, "s")}, "joint_offset": OFFSETS},
-]
-
-
-@pytest.mark.parametrize("effects", PLANTED)
+])  # fmt: skip
 def test_a_corrected_model_reproduces_the_recording_better(effects):
     values = {name: {k: v for k, (v, _) in table.items()} for name, table in effects.items()}
     truth = performed(STACK, HAND, [BLOCKS], [5], values)[0]

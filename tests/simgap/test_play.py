@@ -30,6 +30,9 @@ from simgap.play.session import Session, default_rig, default_task
 from simgap.play.world import effect_values, felt_effects, scene_with, sensed
 from simgap.world.properties import PAPER_BLOCKS
 
+NONSENSE = ("", "[]", "null", '{"kind": "aim"}', '{"kind": "aim", "x": "a", "y": 0, "closed": 1}', "[" * 3000,
+            '{"kind": "effect", "name": ["x"]}', '{"kind": "touch", "tips": [[1]]}', b"\xff")  # fmt: skip
+
 
 @pytest.fixture(scope="module")
 def made() -> Session:
@@ -120,8 +123,7 @@ def test_scene_effects_change_the_scene():
     effects = {"grip_slip": {"mu": 0.1}, "table_compliance": {"stiffness": 900.0},
                "fingertip_compliance": effect_values("fingertip_compliance")}  # fmt: skip
     rig, blocks, around = scene_with(effects, default_rig(), PAPER_BLOCKS)
-    assert {block.friction for block in blocks.values()} == {0.1}
-    assert around.support_stiffness == 900.0
+    assert {block.friction for block in blocks.values()} == {0.1} and around.support_stiffness == 900.0
     assert rig.fingertip.normal_stiffness == 800.0
 
 
@@ -138,8 +140,7 @@ def test_every_offered_effect_can_be_felt(name):
     force = np.ones((400, 2, 2)) * np.linspace(0, 2, 400)[:, None, None]
     place = np.zeros((400, 2, 2))
     out = sensed({name: effect_values(name)}, t, place, place, force, default_rig())
-    assert out.shape == force.shape
-    assert np.isfinite(out).all()
+    assert out.shape == force.shape and np.isfinite(out).all()
 
 
 def test_a_diagnosis_names_what_stands_beside(tmp_path):
@@ -165,15 +166,8 @@ def test_a_diagnosis_names_what_stands_beside(tmp_path):
 ])  # fmt: skip
 def test_bad_input_is_told_in_one_line(arguments, line, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["play", *arguments, "--no-open"]) == 2
-    assert line in capsys.readouterr().err
+    assert main(["play", *arguments, "--no-open"]) == 2 and line in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-NONSENSE = (
-    "", "[]", "null", '{"kind": "aim"}', '{"kind": "aim", "x": "a", "y": 0, "closed": 1}', "[" * 3000,
-    '{"kind": "effect", "name": ["x"]}', '{"kind": "touch", "tips": [[1]]}', b"\xff",
-)  # fmt: skip
 
 
 @pytest.fixture
@@ -212,10 +206,8 @@ def test_the_socket_plays_and_shrugs_at_nonsense(server):
         while answers(socket, "frame")["t"] < start + 1.2:
             pass
         assert abs(np.mean(answers(socket, "frame")["worlds"][0]["tips"], axis=0)[0] - 0.1) < 0.01
-        with (
-            pytest.raises(ConnectionClosed, match="somebody plays already"),
-            connect(f"ws://{where}socket", origin=f"http://{where.rstrip('/')}") as second,
-        ):
+        with (pytest.raises(ConnectionClosed, match="somebody plays already"),
+              connect(f"ws://{where}socket", origin=f"http://{where.rstrip('/')}") as second):  # fmt: skip
             second.recv(timeout=30)
         socket.send(json.dumps({"kind": "save"}))
         assert answers(socket, "saved")["file"] == str(folder / "trial_01.csv")
@@ -287,10 +279,8 @@ def test_two_touches_in_a_real_browser_lift_a_block(tmp_path):
         for apart, height in ((0.015, y), (-0.008, y), (-0.008, y + 0.012)):
             page.touch("touchMove", (x - half - apart, height), (x + half + apart, height))
             page.wait(1.0, False)
-        assert (
-            page.value("frame.worlds[0].force[0][0]") > 1.0
-            and page.value("frame.worlds[0].force[1][0]") < -1.0
-        )
+        assert (page.value("frame.worlds[0].force[0][0]") > 1.0
+                and page.value("frame.worlds[0].force[1][0]") < -1.0)  # fmt: skip
         assert page.value("frame.worlds[0].blocks[0][1]") - y > 0.005
 
 
@@ -329,8 +319,7 @@ def test_the_command_ends_with_its_terminal(tmp_path):
             _, err = process.communicate(timeout=60)
         finally:
             process.kill()
-    assert (process.returncode, err) == (0, "")
-    assert not (tmp_path / "o").exists()
+    assert (process.returncode, err) == (0, "") and not (tmp_path / "o").exists()
 
 
 @pytest.mark.parametrize("at", range(4))

@@ -54,9 +54,8 @@ def recorded(motion: str, seed: int, changed: dict[str, float]) -> Recording:
     return log.with_columns({"duty": duty})
 
 
-def logs(
-    seed: int, motions: tuple[str, ...] = ("slow", "fast", "step", "drop"), **changed: float
-) -> list[Recording]:
+def logs(seed: int, motions: tuple[str, ...] = ("slow", "fast", "step", "drop"),
+         **changed: float) -> list[Recording]:  # fmt: skip
     """One log of every motion."""
     return [recorded(m, seed + k, changed) for k, m in enumerate(motions)]
 
@@ -197,14 +196,12 @@ def test_an_explanations_energy_is_minus_the_log_of_its_evidence():
     every = effects_of(SIMULATOR, logs(0))
     found = changes(SIMULATOR, logs(0), logs(100, gain=3.5), {"gain": replace(every["gain"], fitted=False)})
     one = next(c for c in found.tried if c.effects == ("gain",))
-    of = Hypothesis.about(
-        Comparison(found.composed, found.old, [], found.runs.unit).runs, found.old, ("gain",)
-    )
+    of = Hypothesis.about(Comparison(found.composed, found.old, [], found.runs.unit).runs, found.old,
+                          ("gain",))  # fmt: skip
     x = one.x[0] + np.linspace(-0.1, 0.1, 401)
     costs = np.array([of.cost(np.array([v])) for v in x]) / found.old.dependence
     evidence = logsumexp(-costs - np.log(np.pi * (1 + x**2))) + np.log(x[1] - x[0])
-    assert one.energy == pytest.approx(-evidence, abs=0.1)
-    assert found.p_value < 1e-6
+    assert one.energy == pytest.approx(-evidence, abs=0.1) and found.p_value < 1e-6
 
 
 def test_gains_from_motion_to_motion_are_judged_by_student():
@@ -223,10 +220,8 @@ def test_one_old_log_is_too_few():
         changes(SIMULATOR, logs(0, ("slow",)), logs(1, ("slow",)), {})
 
 
-@pytest.mark.parametrize(
-    ("p", "likelier"), [(1e-6, "unknown"), (0.007, "unknown"), (0.02, "none"), (0.6, "none")]
-)
+@pytest.mark.parametrize(("p", "likelier"),
+                         [(1e-6, "unknown"), (0.007, "unknown"), (0.02, "none"), (0.6, "none")])  # fmt: skip
 def test_unknown_is_likelier_than_none_where_it_is_the_verdict(p, likelier):
     found = _chances(SimpleNamespace(effects=()), {}, 1.0, p)
-    assert max(found, key=lambda n: found[n]) == likelier
-    assert sum(found.values()) == pytest.approx(1.0)
+    assert max(found, key=lambda n: found[n]) == likelier and sum(found.values()) == pytest.approx(1.0)

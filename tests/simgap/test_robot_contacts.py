@@ -127,8 +127,7 @@ def test_flight_and_contact_are_told_apart(dropped):
     phases = phases_of(simulator, [log], windows)
     rows = rows_of([log], windows, noise)
     names = np.array(phases.names)[phases.of(rows)]
-    assert {*names} == {w.regime for w in windows}
-    assert all(names == np.array(REGIMES)[rows.regime])
+    assert {*names} == {w.regime for w in windows} and all(names == np.array(REGIMES)[rows.regime])
 
 
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
@@ -156,8 +155,7 @@ def test_what_lies_still_rests_and_what_slows_down_does_not():
     log = Recording("log.csv", t, {"q": np.where(t < 0.5, 1 - np.exp(-t / 0.1), 1 - np.exp(-5))})
     rests = resting(log, {"q": 1.0})
     rate = np.exp(-t / 0.1) / 0.1
-    assert rests[t > 0.53].all()
-    assert not rests[(rate * 0.04 > AT_REST) & (t < 0.47)].any()
+    assert rests[t > 0.53].all() and not rests[(rate * 0.04 > AT_REST) & (t < 0.47)].any()
 
 
 def test_a_body_at_rest_is_compared_where_the_model_lies_itself(dropped):

@@ -29,11 +29,8 @@ class Servo:
 
     def simulate(self, parameters, recording, start=None):
         """Positions."""
-        return {
-            "pos": follow(
-                parameters["band"] + parameters["friction"], recording["cmd"], start["pos"] if start else 0.0
-            )
-        }
+        return {"pos": follow(parameters["band"] + parameters["friction"], recording["cmd"], start["pos"]
+                              if start else 0.0)}  # fmt: skip
 
 
 def follow(width: float, command: np.ndarray, begin: float, pushed: np.ndarray | None = None) -> np.ndarray:
@@ -60,8 +57,7 @@ def logs(count: int = 4) -> list[Recording]:
 def test_two_that_do_the_same_are_a_set_wherever_the_search_ended():
     found = diagnose(checked(Servo(), "servo"), logs())
     told = body(found)
-    assert told["verdict"] == "set"
-    assert {*told["causes"], *told["indistinguishable"]} == {"band", "friction"}
+    assert told["verdict"] == "set" and {*told["causes"], *told["indistinguishable"]} == {"band", "friction"}
     for name in ("band", "friction"):
         (width,) = told["effects"][name]["parameters"].values()
         assert abs(width["mean"] - WIDTH) < 0.2 * WIDTH, name

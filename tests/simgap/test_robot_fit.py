@@ -72,8 +72,7 @@ def test_what_does_the_same_by_the_same_share_is_judged_too():
     best = search.forced(("torque_scale",))
     search._judge_twins(best, "torque_scale")
     (twin,) = {*search.fitted} - {frozenset(), frozenset(best.names)}
-    assert twin == {"command:torque.gain"}
-    assert search.fitted[twin].score == pytest.approx(best.score, abs=2.0)
+    assert twin == {"command:torque.gain"} and search.fitted[twin].score == pytest.approx(best.score, abs=2.0)
     assert search.fitted[twin].point["command:torque.gain"]["gain"] == pytest.approx(0.4, abs=0.01)
 
 
@@ -131,8 +130,7 @@ def test_rivals_are_fitted_to_the_end_before_they_are_ruled_out(damped, monkeypa
         one = replace(best, names=(name,), score=best.score + score, promise=best.score + promise)
         search.fitted[frozenset(one.names)] = one
     monkeypatch.setattr(search, "fit", lambda names, *_: again.append(names))
-    assert search._settled(best) is best
-    assert again == [("near",)]
+    assert search._settled(best) is best and again == [("near",)]
 
 
 @pytest.mark.parametrize(("gain", "better"), [(0.0, True), (9.0, True), (-9.0, False)])
@@ -140,12 +138,9 @@ def test_of_what_explains_alike_the_simpler_is_preferred(damped, monkeypatch, ga
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     held_out = {"coulomb": np.full(4, gain), "stribeck": np.zeros(4)}
     monkeypatch.setattr(search, "_held_out", lambda one, _: held_out[one.names[0]])
-    one, two = (
-        SimpleNamespace(names=(n,), score=score, sets=SimpleNamespace(size=size), discrepancy={})
-        for n, score, size in (("coulomb", 0.5, (1,)), ("stribeck", 0.0, (2,)))
-    )
-    assert search._is_better(one, two) is better
-    assert not search._is_better(two, one)
+    one, two = (SimpleNamespace(names=(n,), score=score, sets=SimpleNamespace(size=size), discrepancy={})
+                for n, score, size in (("coulomb", 0.5, (1,)), ("stribeck", 0.0, (2,))))  # fmt: skip
+    assert search._is_better(one, two) is better and not search._is_better(two, one)
 
 
 def test_a_small_gap_whose_only_cause_is_doubted_is_none():
@@ -157,8 +152,7 @@ def test_a_small_gap_whose_only_cause_is_doubted_is_none():
     far = Shrinkage(1.0, 1.0, 1.0, 0.0, (0.0, 0.0), {}, *np.zeros((3, 1)))
     phases = phases_of(model.simulator, model.recordings, model.windows)
     found = verdict_on(search, best, far, phases, 0, False)
-    assert found.detection.p_value < 0.01 and found.doubts
-    assert (found.verdict, found.causes) == ("none", ())
+    assert found.detection.p_value < 0.01 and found.doubts and (found.verdict, found.causes) == ("none", ())
 
 
 class Two:
@@ -199,12 +193,10 @@ def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
     assert {*none.discrepancy} >= {"angle_a", "angle_b"}
     sets, levels = search.propose(none, names)
     hidden = float(sets.scores([names[:1]], 0)[0] - sets.scores([()], 0)[0])
-    large, small, both = (
-        search.fit(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, [levels[-1]])
-        for one in (names[:1], names[1:], names)
-    )
-    assert large.score - none.score > 1.5 * hidden > 30
-    assert both.score > large.score + 20 > small.score + 40
+    large, small, both = (search.fit(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005}
+                                           for n in one}, [levels[-1]])
+                          for one in (names[:1], names[1:], names))  # fmt: skip
+    assert large.score - none.score > 1.5 * hidden > 30 and both.score > large.score + 20 > small.score + 40
     left = [one.discrepancy for one in (large, small, both)]
     assert left[0].get("angle_a", 0.0) < 0.02 * none.discrepancy["angle_a"] < left[1]["angle_a"]
     assert "angle_b" in left[0] and "angle_b" not in left[1] and not left[2]
@@ -245,8 +237,7 @@ def test_a_start_that_says_much_of_what_follows_is_no_gap():
     white = covariances(model, linear).whitener()(linear.residual)
     search = Search(model, tuple(model.effects), model.rows.log)
     nothing = search.nothing()
-    assert np.mean(white**2) > 2
-    assert nothing.squares.mean() < 1.2 and not nothing.discrepancy
+    assert np.mean(white**2) > 2 and nothing.squares.mean() < 1.2 and not nothing.discrepancy
 
 
 def test_priors_are_cauchy_and_of_what_is_fitted_along_normal():

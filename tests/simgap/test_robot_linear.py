@@ -40,8 +40,7 @@ def test_windows_tile_every_log_from_where_a_start_can_be_read():
     for number, recording in enumerate(model.recordings):
         mine = [w for w in model.windows if w.log == number]
         assert recording.t[mine[0].begin] - recording.t[0] == pytest.approx(REACH, abs=1e-3)
-        assert mine[-1].end == len(recording)
-        assert all(a.end == b.begin for a, b in itertools.pairwise(mine))
+        assert mine[-1].end == len(recording) and all(a.end == b.begin for a, b in itertools.pairwise(mine))
 
 
 def test_no_window_runs_across_a_gap_in_its_log():
@@ -169,8 +168,7 @@ def test_what_only_acts_together_is_said():
 
 def test_resolution_is_found_and_only_where_there_is_one():
     values = np.random.default_rng(0).standard_normal(500)
-    assert resolution(values) < 1e-4
-    assert resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
+    assert resolution(values) < 1e-4 and resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
 
 
 def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
@@ -212,9 +210,8 @@ def test_numerics_are_exact_at_a_point_and_constant_about_it():
         near = pytest.approx(exact.moved[name].jacobian, rel=1e-6, abs=1e-9)
         assert linear.moved[name].jacobian == near
     doubled = linearise(made, point, ["step"]).moved["step"]
-    assert 0.5 * doubled.jacobian[:, 0] == pytest.approx(
-        0.01 * 0.5 * (made.rows.observed - exact.residual), rel=1e-3, abs=1e-9
-    )
+    assert 0.5 * doubled.jacobian[:, 0] == pytest.approx(0.01 * 0.5 * (made.rows.observed - exact.residual),
+                                                         rel=1e-3, abs=1e-9)  # fmt: skip
 
 
 @pytest.mark.parametrize("course", [lambda t: 0 * t, lambda t: -4.9 * t**2, lambda t: np.sin(3 * t)])
@@ -269,9 +266,8 @@ def test_a_task_names_the_phases_of_logs():
 
 def test_what_is_no_sequence_and_what_is_no_column_is_said():
     logs = [log(0)]
-    blocks = parse_task(
-        {"objects": {"block1": {"on": "ground"}}, "moves": [{"object": "block1", "to": "ground"}]}
-    )
+    blocks = parse_task({"objects": {"block1": {"on": "ground"}},
+                         "moves": [{"object": "block1", "to": "ground"}]})  # fmt: skip
     assert isinstance(blocks, BlockTask)
     with pytest.raises(InputError, match="task of blocks"):
         phases_by_task(logs, blocks)

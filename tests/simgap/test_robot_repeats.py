@@ -68,8 +68,7 @@ def test_logs_are_repeats_where_their_commands_are_alike():
     rng = np.random.default_rng(0)
     still = np.zeros((LOGS, T.size))
     made = composed(still, rng, [1.0, 1.0, 2.0, 1.0, 2.0, 1.0005, 3.0, 1.0])
-    assert made.motion == (0, 0, 1, 0, 1, 0, 2, 0)
-    assert made.repeats() == [5, 5, 2, 5, 2, 5, 1, 5]
+    assert made.motion == (0, 0, 1, 0, 1, 0, 2, 0) and made.repeats() == [5, 5, 2, 5, 2, 5, 1, 5]
     of_three = [k for k, w in enumerate(made.windows) if w.log in (0, 1, 6)]
     assert made.among(of_three).repeats() == [2, 2, 1]
 

@@ -26,15 +26,12 @@ def told(mean: float | None, sd: float = 0.01) -> dict:
 
 def test_a_history_says_within_moved_and_cannot_tell_since_when_it_was_known():
     old = {"a": told(1.0), "b": told(1.0), "c": told(1.0), "d": told(1.0)}
-    past = [
-        {"date": "2026-01-01", "parameters": old},
-        {"date": "2026-02-01", "parameters": {"b": told(None)}},
-    ]
+    past = [{"date": "2026-01-01", "parameters": old},
+            {"date": "2026-02-01", "parameters": {"b": told(None)}}]  # fmt: skip
     now = {"a": told(1.01), "b": told(1.2), "c": told(1.025), "d": told(None), "new": told(1.0)}
     found = compared(past, now)
-    assert {n: v["says"] for n, v in found.items()} == {
-        "a": "within", "b": "moved", "c": "cannot tell", "d": "cannot tell",
-    }  # fmt: skip
+    assert {n: v["says"] for n, v in found.items()} == {"a": "within", "b": "moved", "c": "cannot tell",
+                                                        "d": "cannot tell"}  # fmt: skip
     assert found["b"]["since"] == "2026-01-01" and found["b"]["then"] == 1.0
 
 
@@ -62,12 +59,10 @@ def test_a_history_that_is_none_names_its_line(tmp_path, line):
 
 
 def test_what_was_named_stands_over_what_was_calibrated_and_of_a_set_nothing_is_told():
-    body = {
-        "verdict": "named", "causes": ["joint:a.f"], "indistinguishable": [],
-        "effects": {"joint:a.f": {"parameters": {"f": told(2.0)}},
-                    "s": {"parameters": {"v": told(1.0), "w": told(4.0)}}},
-        "calibrated": {"parameters": {"joint:a.f": told(1.0), "g": told(3.0)}},
-    }  # fmt: skip
+    body = {"verdict": "named", "causes": ["joint:a.f"], "indistinguishable": [],
+            "effects": {"joint:a.f": {"parameters": {"f": told(2.0)}},
+                        "s": {"parameters": {"v": told(1.0), "w": told(4.0)}}},
+            "calibrated": {"parameters": {"joint:a.f": told(1.0), "g": told(3.0)}}}  # fmt: skip
     assert {n: p["mean"] for n, p in intervals(body).items()} == {"joint:a.f": 2.0, "g": 3.0}
     found = intervals(body | {"verdict": "set", "indistinguishable": ["s"]})
     assert {n: p["mean"] for n, p in found.items()} == {"joint:a.f": None, "g": 3.0, "s.v": None, "s.w": None}
@@ -97,10 +92,8 @@ def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
         save=lambda path: None, flush=lambda: None,
         send_columns=lambda entity, indexes, columns: sent.append((entity, *indexes, columns)),
     )  # fmt: skip
-    fake = SimpleNamespace(
-        RecordingStream=lambda name: stream, TimeColumn=lambda name, duration: duration,
-        Scalars=SimpleNamespace(columns=lambda scalars: scalars),
-    )  # fmt: skip
+    fake = SimpleNamespace(RecordingStream=lambda name: stream, TimeColumn=lambda name, duration: duration,
+                           Scalars=SimpleNamespace(columns=lambda scalars: scalars))  # fmt: skip
     monkeypatch.setitem(sys.modules, "rerun", fake)
     t = np.array([0.0, np.nan, 1.0])
     write_rerun(tmp_path / "a.rrd", [Course("a.csv", "q", "deg", t, t, t + 1, t + 2, 1.0)])
@@ -110,11 +103,9 @@ def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
 
 
 def test_a_model_that_flies_off_is_one_line():
-    with (
-        Output("diagnose", quiet=True) as out,
-        pytest.raises(InputError, match="runs far away from the logs"),
-        show_stages(out, "diagnosing", 1),
-    ):
+    with (Output("diagnose", quiet=True) as out,
+          pytest.raises(InputError, match="runs far away from the logs"),
+          show_stages(out, "diagnosing", 1)):  # fmt: skip
         np.linalg.cholesky(-np.eye(2))
 
 
@@ -127,5 +118,4 @@ def test_options_that_cannot_be_are_said_at_once(tmp_path, capsys, options, line
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "rerun", None)
     (tmp_path / "a.csv").write_text(json.dumps("t"))
-    assert main(["diagnose", "a.csv", *options]) == 2
-    assert line in capsys.readouterr().err
+    assert main(["diagnose", "a.csv", *options]) == 2 and line in capsys.readouterr().err

@@ -97,8 +97,7 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
     found = cov.estimate(rows)
     assert {*found} == {"p"} and found["p"] == pytest.approx(0.7, rel=0.2)
     white = cov.whitener(found)(rows)
-    assert np.mean(white**2) == pytest.approx(1.0, rel=0.1)
-    assert cov.outliers(cov.whitener(found), rows) == {}
+    assert np.mean(white**2) == pytest.approx(1.0, rel=0.1) and cov.outliers(cov.whitener(found), rows) == {}
     rows[160:240] *= 3.0
     wide = cov.outliers(cov.whitener(cov.estimate(rows)), rows)
     assert {*wide} == {2} and wide[2] == pytest.approx(9.0, rel=0.4)
@@ -140,10 +139,8 @@ def test_noise_leaves_the_floor():
 
 
 def test_a_value_at_a_bound_is_doubted_but_for_nothing_at_all():
-    known = {
-        "rubs": RobotEffect("rubs", "", {"loss": Parameter(0.02, 0.01, "N m", low=0.0)}),
-        "weighs": RobotEffect("weighs", "", {"mass": Parameter(1.0, 0.1, "kg", low=0.3)}),
-    }
+    known = {"rubs": RobotEffect("rubs", "", {"loss": Parameter(0.02, 0.01, "N m", low=0.0)}),
+             "weighs": RobotEffect("weighs", "", {"mass": Parameter(1.0, 0.1, "kg", low=0.3)})}  # fmt: skip
     best = SimpleNamespace(point={"rubs": {"loss": 0.0}, "weighs": {"mass": 0.3}})
     assert _absurd(known, best, ["rubs"]) == ()  # type: ignore[arg-type]
     assert _absurd(known, best, ["rubs", "weighs"]) == ("weighs mass 0.3 kg is no value of a robot's",)  # type: ignore[arg-type]
@@ -183,18 +180,13 @@ def test_log_odds_count_less_where_residuals_vary_more_than_their_discrepancy():
 
 
 def test_what_replaces_a_cause_is_told_although_it_could_replace_a_small_effect_too():
-    sets = [
-        SimpleNamespace(names=names, score=score)
-        for names, score in [(("load", "hold", "hum"), 0.0), (("load", "hold", "lag"), -1.0),
-                             (("load", "lag", "hum"), -9.0), (("load", "gain", "lag"), -9.0)]
-    ]  # fmt: skip
+    sets = [SimpleNamespace(names=names, score=score)
+            for names, score in [(("load", "hold", "hum"), 0.0), (("load", "hold", "lag"), -1.0),
+                                 (("load", "lag", "hum"), -9.0),
+                                 (("load", "gain", "lag"), -9.0)]]  # fmt: skip
     found = _explanations(sets[1:], sets[0], ("hold", "load"), {"hum", "lag"}, 1.0)  # type: ignore[arg-type]
-    assert [one.causes for one in found] == [
-        ("hold", "load"),
-        ("hold", "load"),
-        ("lag", "load"),
-        ("gain", "load"),
-    ]
+    assert [one.causes for one in found] == [("hold", "load"), ("hold", "load"), ("lag", "load"),
+                                             ("gain", "load")]  # fmt: skip
 
 
 def test_what_starts_make_of_a_residual_is_taken_from_it():
@@ -202,7 +194,6 @@ def test_what_starts_make_of_a_residual_is_taken_from_it():
     noise = np.sqrt(0.5) * rng.standard_normal(320)
     moved = np.concatenate([b.start @ rng.standard_normal(2) for b in cov.blocks])
     left = cov.without_starts(cov.whitener(), noise + moved)
-    assert (
-        np.mean(left**2) == pytest.approx(np.mean(noise**2), rel=0.1) and np.mean((noise + moved) ** 2) > 1.5
-    )
+    assert (np.mean(left**2) == pytest.approx(np.mean(noise**2), rel=0.1)
+            and np.mean((noise + moved) ** 2) > 1.5)  # fmt: skip
     assert np.isnan(cov.without_starts(cov.whitener(), np.where(moved > 9, moved, np.nan))).all()

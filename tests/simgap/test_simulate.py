@@ -33,8 +33,7 @@ def test_a_trial_shows_its_task(stacked):
     t = signals.t
     gripped = signals.grip > 0.1
     held = (t > touch + 0.06) & (t < part - 0.06)
-    assert gripped[held].all()
-    assert not gripped[t < touch - 0.01].any()
+    assert gripped[held].all() and not gripped[t < touch - 0.01].any()
     carried = (t > leave + 0.1) & (t < meet - 0.1)
     assert np.mean(signals.fy[carried]) == pytest.approx(0.343, abs=0.01)
     assert np.mean(signals.fy[(t > meet + 0.1) & (t < part - 0.1)]) < 0
@@ -74,8 +73,7 @@ def test_a_seed_gives_one_trial_and_another_seed_another(stacked):
 def test_any_task_ends_as_described(task):
     blocks = random_properties(task, 1)
     done = simulate_trials(task, RIG, [blocks], [1])[0]
-    assert np.isfinite(done.boundaries).all()
-    assert (np.diff(done.boundaries) > 0).all()
+    assert np.isfinite(done.boundaries).all() and (np.diff(done.boundaries) > 0).all()
     support = dict(task.initial) | {move.object: move.to for move in task.performed}
     x, y = (dict(zip(task.objects, done.motion.blocks[-1, :, k], strict=True)) for k in (0, 1))
     for name, on in support.items():
@@ -90,8 +88,7 @@ def test_a_slide_moves_the_block_along_the_ground_between_its_boundaries():
     start, stop = done.boundaries[1:3]
     x, y = done.motion.blocks[:, 0, 0], done.motion.blocks[:, 0, 1]
     before, after = (x[np.searchsorted(done.t, time)] for time in (start, stop))
-    assert abs(after - before) > 0.02
-    assert abs(before - x[0]) < 1e-3
+    assert abs(after - before) > 0.02 and abs(before - x[0]) < 1e-3
     assert np.ptp(y[: np.searchsorted(done.t, done.boundaries[3])]) < 1e-4
 
 
@@ -103,8 +100,7 @@ def test_a_grip_that_cannot_hold_is_no_silent_success():
 def test_a_cartesian_hand_records_positions():
     rig = Rig(rate=100.0, fingertip=RIG.fingertip, noise=Noise(position=1e-5, velocity=1e-3, force=0.01))
     done = simulate_trials(STACK, rig, [PAPER_BLOCKS], [0])[0]
-    assert set(done.trial.channels) >= {"x1", "vy2", "fx1"}
-    assert done.trial.rate == pytest.approx(100.0)
+    assert set(done.trial.channels) >= {"x1", "vy2", "fx1"} and done.trial.rate == pytest.approx(100.0)
 
 
 def test_properties_come_from_the_json_of_identify(tmp_path):

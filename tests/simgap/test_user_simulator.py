@@ -161,9 +161,8 @@ def test_a_missing_file_and_a_spec_without_a_name():
 def test_a_slower_column_has_no_more_samples_than_were_read(tmp_path):
     path, rng = tmp_path / "log.csv", np.random.default_rng(0)
     fast, slow = rng.standard_normal(200), rng.standard_normal(200)
-    path.write_text("t,x,y\n" + "".join(
-        f"{0.01 * i:.2f},{fast[i]:.6f},{'' if i % 2 else f'{slow[i]:.6f}'}\n" for i in range(200)
-    ))  # fmt: skip
+    path.write_text("t,x,y\n" + "".join(f"{0.01 * i:.2f},{fast[i]:.6f},{'' if i % 2 else f'{slow[i]:.6f}'}\n"
+                                        for i in range(200)))  # fmt: skip
     log = read_recording(path, ["x", "y"])
     assert np.isfinite(log["x"]).all() and np.flatnonzero(np.isfinite(log["y"])).tolist() == [
         *range(0, 200, 2)

@@ -65,8 +65,7 @@ def test_rigid_fingertips_get_a_stiff_pad_and_smaller_steps():
 def test_replay_of_a_simulated_trial_leaves_the_sensors_noise(performed):
     result = replay(performed.trial, STACK, HAND, PAPER_BLOCKS, boundaries=performed.boundaries)
     rest = residual_summary(result, performed.boundaries, STATES)
-    assert rest["free-motion"] < 1.15
-    assert rest["hold-above-ground"] < 1.5
+    assert rest["free-motion"] < 1.15 and rest["hold-above-ground"] < 1.5
     end = result.motion.blocks[-1]
     np.testing.assert_allclose(end, performed.motion.blocks[-1], atol=2e-3)
 
@@ -78,9 +77,8 @@ def test_smoothing_keeps_a_parabola_and_averages_a_rest():
     sd = np.full((t.size, 2), 2e-5)
     exact = smooth(t, truth, speed, sd, 100 * sd)
     np.testing.assert_allclose(exact.position, truth, atol=1e-9)
-    np.testing.assert_allclose(
-        exact.at(np.array([1.234]))[0][0], [0.1 + 0.02 * 1.234 - 0.03 * 1.234**2, 0.05], atol=1e-9
-    )
+    np.testing.assert_allclose(exact.at(np.array([1.234]))[0][0],
+                               [0.1 + 0.02 * 1.234 - 0.03 * 1.234**2, 0.05], atol=1e-9)  # fmt: skip
     rng = np.random.default_rng(0)
     noise = [scale * rng.standard_normal(sd.shape) for scale in (2e-5, 2e-3)]
     noisy = smooth(t, truth + noise[0], speed + noise[1], sd, 100 * sd)
@@ -133,8 +131,7 @@ def test_the_sampled_data_limit_bounds_what_a_damped_device_can_swallow():
 def test_control_takes_back_what_the_hold_and_the_delay_made(delay):
     stiffness = 20e3
     loose, _ = wall(stiffness, 2.0, controlled=False, delay=delay)
-    assert loose > 5e-3
-    assert wall(stiffness, 2.0, controlled=True, delay=delay)[0] < 1e-9
+    assert loose > 5e-3 and wall(stiffness, 2.0, controlled=True, delay=delay)[0] < 1e-9
 
 
 def test_control_leaves_a_passive_contact_alone():
@@ -148,5 +145,4 @@ def test_control_leaves_a_passive_contact_alone():
 @pytest.mark.parametrize("rate", [1000.0, 4000.0])
 def test_the_virtual_block_is_passive_in_a_delayed_loop(rate):
     found = squeeze(rate, 4000.0, 2e-3, controlled=False, seconds=0.4)
-    assert found["returned_J"] < 1e-9
-    assert found["speed_left"] < 0.02
+    assert found["returned_J"] < 1e-9 and found["speed_left"] < 0.02

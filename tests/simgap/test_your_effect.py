@@ -68,9 +68,8 @@ def test_it_is_named_in_given_trials(step):
     rng = np.random.default_rng(3)
     real, first = ensemble(rng, 6)
     sim, second = ensemble(rng, 6, name="sim")
-    changed = [
-        Trial(t.file, t.t, t.channels | {"fa": step.read(t.t, t.channels["fa"], {"step": 1.0})}) for t in real
-    ]
+    changed = [Trial(t.file, t.t, t.channels | {"fa": step.read(t.t, t.channels["fa"], {"step": 1.0})})
+               for t in real]  # fmt: skip
     body = diagnose(align(changed, sim, TASK, boundaries=first | second)).body
     assert body["causes"] == ["force_step"]
     assert body["effects"]["force_step"]["parameters"]["fa"]["mean"] == pytest.approx(1.0, rel=0.1)
