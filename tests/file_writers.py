@@ -23,12 +23,7 @@ ODD_START = 1_764_000_000_123_456_789  # ns since 1970
 
 @dataclass(frozen=True)
 class Topic:
-    """Messages of one kind at times [ns since 1970] (num_messages,).
-
-    `values` by field: of a wrench and a pose `force`, `torque`, `position` (num_messages, 3), what is absent
-    zero; of a JointState columns by the joints' names in `position` and `velocity`; of a Float64 `data`
-    (num_messages,), which has no stamp.
-    """
+    """Messages of a kind at times [ns since 1970] (num_messages,); `values` by field, what is absent zero."""
 
     name: str
     kind: str
@@ -95,7 +90,6 @@ def _ordered(topics: list[Topic]) -> list[tuple[Topic, int]]:
 
 
 def force(ns):
-    """The planted wrench's x [N] at times since the start [ns]."""
     return 2 + np.sin(np.asarray(ns) * 1e-9)
 
 
@@ -105,7 +99,6 @@ def height(ns):
 
 
 def joint(ns):
-    """The planted second joint [rad]."""
     return -1.0 + 0.3 * np.asarray(ns) * 1e-9
 
 
@@ -124,7 +117,6 @@ def planted(gap: tuple[int, int] = (0, 0)) -> list[Topic]:
 
 
 def write_mcap(path: Path, gap: tuple[int, int] = (0, 0)) -> Path:
-    """The planted topics in an MCAP log."""
     return mcap_of(path, planted(gap))
 
 
@@ -166,10 +158,7 @@ def write_lerobot(folder: Path, version: int = 3, episodes: int = 3) -> Path:
 
 def lerobot_of(folder: Path, version: int, fps: int, names: list[str], states: list[np.ndarray],
                actions: list[np.ndarray]) -> Path:  # fmt: skip
-    """A data set as LeRobot lays it out: a file an episode (2), or all in one (3).
-
-    `states` of each episode (num_timesteps, num_names), `actions` (num_timesteps, 2).
-    """
+    """A data set as LeRobot has it, a file an episode (2) or all in one (3)."""
     (folder / "meta").mkdir(parents=True)
     (folder / "data/chunk-000").mkdir(parents=True)
     name = "episode_{episode_index:06d}" if version == 2 else "file-{file_index:03d}"
@@ -206,10 +195,7 @@ def lerobot_of(folder: Path, version: int, fps: int, names: list[str], states: l
 
 
 def finger_topics(c: dict[str, np.ndarray]) -> list[Topic]:
-    """Two fingertips that close along y and lift along z: poses twice as often as wrenches.
-
-    `c`: columns t, x1, y1, fx1, fy1, x2, y2, fx2, fy2 (num_timesteps,).
-    """
+    """Two fingertips that close along y and lift along z: poses twice as often as wrenches."""
     t, twice = c["t"], np.sort(np.r_[c["t"], (c["t"][1:] + c["t"][:-1]) / 2])
     out = []
     for side, i in (("left", 1), ("right", 2)):
@@ -222,10 +208,7 @@ def finger_topics(c: dict[str, np.ndarray]) -> list[Topic]:
 
 
 def wrist_topics(c: dict[str, np.ndarray], joints: int = 1) -> list[Topic]:
-    """An arm's pose and wrench on the recording's clock, a gripper's fingers at every `joints`-th time of it.
-
-    `c`: columns t, width, ee_y, ee_z, Fx to Tz (num_timesteps,).
-    """
+    """An arm's pose and wrench on the recording's clock, fingers at every `joints`-th time of it."""
     t, half = c["t"], c["width"][::joints] / 2
     fingers = {"panda_finger_joint1": half, "panda_finger_joint2": half}
     still = {name: 0 * half for name in fingers}
@@ -239,7 +222,6 @@ def wrist_topics(c: dict[str, np.ndarray], joints: int = 1) -> list[Topic]:
 
 
 def stamps(t: np.ndarray) -> np.ndarray:
-    """Times [s] (num_timesteps,) as ns since 1970."""
     return ODD_START + np.round(t * 1e9).astype(np.int64)
 
 
@@ -270,10 +252,7 @@ def wrist_vectors(c: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def german(columns: dict[str, np.ndarray], names: dict[str, tuple[str, float]]) -> bytes:
-    """A spreadsheet's CSV: semicolons, decimal commas, remarks with umlauts, ISO stamps.
-
-    `names`: theirs and how many of their units are one of ours, by column.
-    """
+    """A spreadsheet's CSV; `names`: theirs and how many of their units are one of ours, by column."""
     start = np.datetime64("2026-03-02T10:15:30.250000")
     rows = ["# Prüfstand 3, Messung vom 2.3.2026", "% Greifer mit Schaumbelägen"]
     rows.append(";".join(["Zeitstempel", *(theirs for theirs, _ in names.values())]))

@@ -1,9 +1,4 @@
-"""Trials that do not fit their task, made by editing trials that do.
-
-Every edit takes a trial and its true boundaries [s] between the nine subtasks of the paper's task,
-and gives the edited trial with the index of the first subtask that it does not show. Pieces are
-joined with continuous time; positions jump where pieces meet, as they would under a cut.
-"""
+"""Trials that do not fit their task: edits give the trial and the index of the first subtask not shown."""
 
 import json
 from collections.abc import Callable, Sequence

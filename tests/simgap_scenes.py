@@ -37,8 +37,6 @@ FAR = tips(-1.0, 1.0, 1.0, 1.0)
 
 
 def evolve(constants: Physics, state: State, fingers: Tips, h: float, steps: int) -> State:
-    """All states of `steps` steps of h [s] under tips at rest, stacked."""
-
     def one(s: State, _: None) -> tuple[State, State]:
         s = substep(constants, s, fingers, h)
         return s, s

@@ -1,9 +1,4 @@
-"""Examples run: docstrings of what is public, and the pages of docs/ and README.md.
-
-On a page, blocks marked `python` run in order in one namespace, and lines `$ hmmseg ...` of blocks marked
-`console` run as the command would, in a folder that holds the recordings that come along. A comment
-`<!-- not run: why -->` before a block leaves it out. Pages that take long are marked slow.
-"""
+"""Examples run: docstrings, and blocks `python` and `console` of pages unless a comment says `not run`."""
 
 import doctest
 import importlib
@@ -24,7 +19,6 @@ BLOCK = re.compile(r"(<!-- not run[^>]*-->\s*)?^```(python|console)\n(.*?)^```$"
 
 
 def blocks(text: str) -> list[tuple[str, str]]:
-    """Language and content of the blocks to run."""
     return [(m[2], m[3]) for m in BLOCK.finditer(text) if not m[1]]
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refused
 
 import estimation
 import hmmseg
@@ -19,6 +20,9 @@ STACK = Path(__file__).parents[1] / "recordings" / "none_1"
 PUBLIC = {hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose diagnose "
           "example_folder fit identify segment simulate", estimation: "Identification identify read_actual",
           simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate"}  # fmt: skip
+CELLS = ("import hmmseg\nfolder = hmmseg.example_folder()\n"
+         "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
+         "found[0]", "print(f'{found[0]}')", "found[0].plot()")  # fmt: skip
 
 
 @pytest.mark.parametrize("package", PUBLIC, ids=lambda p: p.__name__)
@@ -98,26 +102,16 @@ def test_readers_take_paths_tables_and_arrays():
 
 
 def test_mistakes_say_what_to_write():
-    with pytest.raises(InputError, match="rig: missing"):
-        segment(STACK / "trial_01.csv", STACK / "task.toml")
-    with pytest.raises(InputError, match="no blocks"):
-        align(STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
+    refused("rig: missing", segment, STACK / "trial_01.csv", STACK / "task.toml")
+    refused("no blocks", align, STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
     bare = hmmseg.Trial("bare", np.arange(9.0), {"x1": np.zeros(9)})
-    with pytest.raises(InputError, match="bare: has no channel fx1"):
-        segment(bare, STACK / "task.toml", STACK / "rig.toml")
+    refused("bare: has no channel fx1", segment, bare, STACK / "task.toml", STACK / "rig.toml")
     with pytest.raises(InputError, match=r"block1\.width: missing; expected a number in m"):
         simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": {"weight": 0.3}, "block2": {}})
-    with pytest.raises(InputError, match="needs no fit"):
-        hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
+    refused("needs no fit", hmmseg.fit, STACK / "trial_01.csv", STACK / "task.toml")
     for none in (lambda: segment([], STACK / "task.toml", STACK / "rig.toml"),
                  lambda: segment([], {"sequence": ["a", "b"]})):  # fmt: skip
-        with pytest.raises(InputError, match="trials: none given; expected at least one trial"):
-            none()
-
-
-CELLS = ("import hmmseg\nfolder = hmmseg.example_folder()\n"
-         "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
-         "found[0]", "print(f'{found[0]}')", "found[0].plot()")  # fmt: skip
+        refused("trials: none given; expected at least one trial", none)
 
 
 def test_a_notebook_shows_every_result_once_and_every_plot():
@@ -134,13 +128,23 @@ def test_a_notebook_shows_every_result_once_and_every_plot():
     assert "pickup block1" in printed[0].text and any("image/png" in output.data for output in plot)
 
 
-def test_results_are_text_though_rich_would_show_them_itself(found, monkeypatch):
+def test_results_read_like_the_terminals_table_and_fill_no_screen(found, monkeypatch):
     monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
     assert "block1" in f"{found}" and "pickup block1" in repr(found.segmentations)
+    seen = {}
+    inside(found, seen)
+    assert len(seen) > 50
+    assert max(len(repr(value)) for value in seen.values()) < 2500  # characters
+    text = repr(found)
+    assert "block1" in text and "weight" in text and "95 % interval" in text
+    assert "<table>" in found._repr_html_() and "<td>block1</td>" in found._repr_html_()
+    segmentation = found.segmentations[0]
+    assert "pickup block1" in repr(segmentation) and "hold-on-ground" in segmentation._repr_html_()
+    aligned = found.aligned
+    assert "trial_02.csv" in repr(aligned) and len(aligned.to_json()["trials"]) == 2
 
 
 def inside(value, seen):
-    """All dataclasses that can be reached from a result."""
     if id(value) in seen:
         return
     if dataclasses.is_dataclass(value):
@@ -150,23 +154,6 @@ def inside(value, seen):
     elif isinstance(value, list | tuple | dict):
         for each in value.values() if isinstance(value, dict) else value:
             inside(each, seen)
-
-
-def test_no_part_of_a_result_fills_the_screen(found):
-    seen = {}
-    inside(found, seen)
-    assert len(seen) > 50
-    assert max(len(repr(value)) for value in seen.values()) < 2500  # characters
-
-
-def test_results_read_like_the_terminals_table(found):
-    text = repr(found)
-    assert "block1" in text and "weight" in text and "95 % interval" in text
-    assert "<table>" in found._repr_html_() and "<td>block1</td>" in found._repr_html_()
-    segmentation = found.segmentations[0]
-    assert "pickup block1" in repr(segmentation) and "hold-on-ground" in segmentation._repr_html_()
-    aligned = found.aligned
-    assert "trial_02.csv" in repr(aligned) and len(aligned.to_json()["trials"]) == 2
 
 
 def test_a_simulated_trial_shows_its_truth(found, tmp_path):
@@ -207,13 +194,10 @@ def test_plots_return_axes_and_save_where_asked(found, tmp_path):
     assert set(found.to_arviz().posterior) == {f"{o}.{p}" for o, p in found.names}
 
 
-def test_blocks_may_be_tables_of_their_properties():
+def test_blocks_may_be_tables_or_an_identification_or_its_json(found, tmp_path):
     one = {"weight": 0.3, "width": 0.02, "height": 0.02}
     made = simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": one, "block2": one})
     assert {made[0].blocks["block1"].weight, made[0].blocks["block2"].weight} == {0.3}
-
-
-def test_an_identification_is_simulated_as_its_json_is(found, tmp_path):
     task = Task.read(STACK / "task.toml")
     high = {name: dataclasses.replace(f, lower_bound=1.5, mu_draws=None)
             for name, f in found.friction.items()}  # fmt: skip

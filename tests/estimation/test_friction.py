@@ -28,10 +28,7 @@ NUM = int(5 * DURATION * RATE)
 
 
 def aligned(signals: Signals, task: BlockTask, boundaries: np.ndarray) -> WeighedTrial:
-    """A trial whose alignments are given: boundaries (num_alignments, num_subtasks - 1) [s].
-
-    Weights are plain means, as far as friction uses them.
-    """
+    """A trial of given boundaries (num_alignments, num_subtasks - 1) [s], its weights plain means."""
     steps = subtasks(task)
     masks = subtask_masks(signals.t, boundaries, len(steps))
     free = masks[0][[s.index for s in steps if s.state == FREE]].any(axis=0)
@@ -70,11 +67,6 @@ def planted(
     return aligned(signals, task, boundaries)
 
 
-def wander(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Ratios of an uneven grip that stays clear of slipping."""
-    return np.abs(0.15 + np.cumsum(rng.normal(0, 0.015, size)))
-
-
 @pytest.mark.parametrize("limit", [np.inf, 0.3])
 def test_lower_bound_covers_the_largest_true_ratio_and_is_close(limit):
     """The naive maximum exceeds the truth nearly always; the 5 % quantile hardly ever."""
@@ -92,16 +84,12 @@ def test_lower_bound_covers_the_largest_true_ratio_and_is_close(limit):
     assert np.mean(below) >= 0.9 and np.mean(naive) > 0.6 and np.median(gap) < 0.045
 
 
-def test_one_sample_alone_does_not_carry_the_bound():
+def test_one_sample_does_not_carry_the_bound_and_alignments_are_marginalised():
     rng = np.random.default_rng(2)
     ratio, sd = np.abs(0.2 + 0.01 * rng.standard_normal(100)), np.full(100, 0.01)
     ratio[50] = 0.9
     draws = largest_ratio(ratio, sd, np.ones((1, 100), bool), rng, 1000)
     assert np.quantile(draws, 0.05) < 0.3 and draws.max() > 0.8
-
-
-def test_alignments_are_marginalised():
-    """High ratios that half of the alignments leave out count in half of the draws."""
     rng = np.random.default_rng(3)
     ratio = np.concatenate([np.full(40, 0.2), np.full(10, 0.5)]) + 0.005 * rng.standard_normal(50)
     held = np.ones((16, 50), bool)
@@ -111,23 +99,17 @@ def test_alignments_are_marginalised():
     assert np.median(draws[draws < 0.45]) == pytest.approx(0.2, abs=0.01)
 
 
-def test_bias_is_removed_and_noise_stated():
+def test_bias_is_removed_uncertain_gain_widens_the_bound_and_nothing_held_gives_a_reason():
     rng = np.random.default_rng(4)
     ratio = np.where(np.arange(NUM) % 20 < 10, 0.25, 0.1)
     found = friction_posteriors([planted(LIFT, ratio, rng, bias=0.15)], LIFT, RIG, SD, rng)["cup"]
     assert found.bound_draws is not None and np.median(found.bound_draws) == pytest.approx(0.25, abs=0.006)
     assert found.lower_bound == np.quantile(found.bound_draws, 0.05) <= 0.25
-
-
-def test_uncertain_force_gain_widens_the_bound():
     rng = np.random.default_rng(5)
     trial = planted(LIFT, np.full(NUM, 0.25), rng)
     rig = RIG.model_copy(update={"systematic": Systematic(force_gain=(0.05,) * 4)})
     found = friction_posteriors([trial], LIFT, rig, SD, rng)["cup"].bound_draws
     assert found is not None and found.std() / found.mean() == pytest.approx(np.hypot(0.05, 0.05), rel=0.15)
-
-
-def test_nothing_held_gives_a_reason():
     rng = np.random.default_rng(6)
     trial = planted(LIFT, np.full(NUM, 0.25), rng, normal=0.0)
     found = friction_posteriors([trial], LIFT, RIG, SD, rng)["cup"]
@@ -155,7 +137,6 @@ def stretches(rng: np.random.Generator, num: int, mu: float | None, drift: float
 @pytest.mark.parametrize(("mu", "drift", "seen"), [(0.25, 0.0, True), (0.25, 3e-5, True), (None, 0.0, False),
                                                   (None, 2e-4, False)])  # fmt: skip
 def test_slip_is_seen_where_it_was_planted(mu, drift, seen):
-    """Also where all anchors drift at random, and never by drift alone."""
     rng = np.random.default_rng(7)
     for _ in range(6):
         own = stretches(rng, 8, mu, drift)
@@ -194,11 +175,11 @@ def test_planted_slip_tells_mu():
 
 @pytest.mark.parametrize(("task", "close"), [(SLID, 0.12), (BOTH, 0.03)])
 def test_sliding_tells_the_friction_of_the_support(task, close):
-    """By the law's slope where the weight is unknown, better where a carry tells it."""
     rng, mu, weight = np.random.default_rng(10), 0.5, 0.6
     z = []
     for _ in range(8):
-        trial = planted(task, wander(rng, len(subtasks(task)) * 20), rng)
+        wander = np.abs(0.15 + np.cumsum(rng.normal(0, 0.015, len(subtasks(task)) * 20)))
+        trial = planted(task, wander, rng)
         s, steps = trial.signals, subtasks(task)
         index = np.minimum((s.t / DURATION).astype(int), len(steps) - 1)
         sliding = np.array([step.name == "slide" for step in steps])[index]
@@ -218,7 +199,6 @@ def test_sliding_tells_the_friction_of_the_support(task, close):
 
 
 def test_intervals_hold_however_few_samples_a_slide_has(monkeypatch):
-    """Six samples and three unknowns leave three to judge the noise by."""
     rng, mu, weight, inside = np.random.default_rng(3), 0.5, 0.6, []
     down, lag = 0.3 * np.linspace(-1, 1, 6), 0.05 * np.array([1, -1, 0, 0, -1, 1])
     for _ in range(400):

@@ -1,13 +1,17 @@
-"""Tables written into documents; the bank's deviating hands and the summaries of estimates."""
+"""Constants, results and tables say where they come from; hands of the bank and summaries of estimates."""
 
+import json
 import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import experiments.constants as table
 from experiments.blind_check.tables import fresh
 from experiments.calibration import Estimates, summarise_estimates
+from experiments.saving import commit_of, save
 from experiments.worlds import Deviations, deviated, scene, simulated_cases
 from experiments.write_tables import TABLES, fill
 from hmmseg.hand.signals import task_space
@@ -70,7 +74,7 @@ def trial():
     return simulated_cases(1, trials=1, seed=20_990)[0].trials[0]
 
 
-def test_a_rig_that_knows_the_links_reads_the_true_tips(trial):
+def test_deviated_hands_are_read_by_rigs_that_know_their_links_gains_biases_and_pads(trial):
     rig, _ = scene()
     changed = deviated(trial, rig, hand(link_length=0.01, joint_offset=0.002))
     true = {i: f.model_copy(update={"links": tuple(1.01 * x for x in f.links)})
@@ -80,10 +84,6 @@ def test_a_rig_that_knows_the_links_reads_the_true_tips(trial):
     expected = task_space(trial, rig)
     for name in ("x1", "y1", "x2", "y2", "vx1", "vy2"):
         np.testing.assert_allclose(getattr(knowing, name), getattr(expected, name), atol=1e-9)
-
-
-def test_gain_comes_before_bias_and_stiffer_pads_stand_further_out(trial):
-    rig, _ = scene()
     changed = deviated(trial, rig, hand(force_gain=0.1, force_bias=0.05, pad_stiffness=1.0))
     np.testing.assert_allclose(changed.channels["fx1"], 1.1 * trial.channels["fx1"] + 0.05)
     before, after = task_space(trial, rig), task_space(changed, rig)
@@ -98,3 +98,56 @@ def test_a_spent_blind_set_is_no_result(monkeypatch):
     assert fresh() is None
     seals["blind_sets"] = {"sets": [{"seal": "b"}]}
     assert fresh() is seals["blind_check"]
+
+
+def test_every_constant_has_a_kind_and_a_reason_as_its_comment_means_it(tmp_path, monkeypatch):
+    assert [f"{c.file}: {c.name}" for c in table.every() if c.kind == "unstated" or not c.reason] == []
+    monkeypatch.setattr(table, "ROOT", tmp_path)
+    (tmp_path / "module.py").write_text("# physics: m/s^2\nGRAVITY = 9.81\n"
+                                        "FEWEST = 6  # chosen: samples of a window\n"
+                                        "# prior: s on either side\n"
+                                        "REACH = 0.03\n"
+                                        "LONG = 4.0  # numerics: goes on\n# below it\n"
+                                        "NAMES = ('a', 'b')\nBARE = 3.0\n")  # fmt: skip
+    found = [(c.name, c.value, c.kind, c.reason) for c in table.constants(tmp_path / "module.py")]
+    assert found == [("GRAVITY", "9.81", "physics", "m/s^2"),
+                     ("FEWEST", "6", "chosen", "samples of a window"),
+                     ("REACH", "0.03", "prior", "s on either side"),
+                     ("LONG", "4.0", "numerics", "goes on below it"),
+                     ("BARE", "3.0", "unstated", "")]  # fmt: skip
+
+
+def test_a_result_says_which_code_made_it_and_nan_is_refused(tmp_path):
+    save(tmp_path / "new" / "found.json", {"value": 1.5})
+    found = json.loads((tmp_path / "new" / "found.json").read_text())
+    assert found == {"value": 1.5, "made_by": commit_of()}
+    assert found["made_by"] is None or len(found["made_by"].rstrip("+")) >= 12
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        save(tmp_path / "found.json", {"value": float("nan")})
+    assert not (tmp_path / "found.json").exists()
+
+
+def test_changed_code_is_told(tmp_path):
+    def git(*words: str) -> None:
+        who = ["-c", "user.name=a", "-c", "user.email=a@b"]
+        subprocess.run(["git", *who, *words], cwd=tmp_path, check=True, capture_output=True)
+
+    assert commit_of(tmp_path) is None
+    git("init")
+    (tmp_path / "code.py").write_text("a = 1\n")
+    git("add", ".")
+    git("commit", "-m", "first")
+    clean = commit_of(tmp_path)
+    assert clean is not None and not clean.endswith("+")
+    (tmp_path / "result.json").write_text("{}\n")
+    assert commit_of(tmp_path) == clean
+    (tmp_path / "code.py").write_text("a = 2\n")
+    assert commit_of(tmp_path) == clean + "+"
+
+
+def test_every_result_says_which_code_made_it():
+    known = {"blind_seal.json"}  # a list of hashes, each with the commits that drew and diagnosed the set
+    for path in sorted((ROOT / "experiments" / "results").rglob("*.json")):
+        if path.name not in known:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            assert {"made_by", "commits"} & found.keys(), path.name

@@ -45,7 +45,6 @@ SOME = [Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
 
 
 def linear(root, speed, kind, sd=1e-7):
-    """Uniform motion with this speed that crosses zero at `root` [s]."""
     left = -speed * root
     if kind == "impact":  # stops dead after the touch, up to the pad's compression
         return Crossing(left, 0.15 * speed * (WIDTH - root), speed, 0.0, sd, sd, 1e-5, kind)
@@ -122,7 +121,6 @@ def test_where_nothing_more_is_known_a_boundary_is_anywhere_in_its_interval():
 
 
 def coverage(draw, rng, num=600):
-    """Share of true roots inside the central 90 % interval, roots drawn by `draw(rng)`."""
     inside = 0
     for _ in range(num):
         root, crossing = draw(rng)
@@ -133,7 +131,6 @@ def coverage(draw, rng, num=600):
 
 
 def smooth_case(rng):
-    """Constant velocity, measured at both ends with noise; the root is uniform in the interval."""
     root, speed, sd, sd_v = rng.uniform(0, WIDTH), 0.05, 2e-4, 2e-3
     values = np.array([-speed * root, speed * (WIDTH - root)]) + sd * rng.normal(size=2)
     rates = speed + sd_v * rng.normal(size=2)
@@ -141,11 +138,7 @@ def smooth_case(rng):
 
 
 def touches(rng, width, num=1):
-    """Time at which all of `num` fingers that move as one have hit, and their crossings.
-
-    A minimum-jerk motion of log-uniform duration; each finger's face lies anywhere on its way, the
-    first finger's root is uniform in the interval.
-    """
+    """Time at which all of `num` fingers that move as one, by minimum jerk, have hit, and their crossings."""
     sd_left, sd_right, sd_v = 4e-5, 5e-6, 2e-3
     phases = np.linspace(0, 1, 10_001)
     at_hit = np.interp(rng.uniform(), _minimum_jerk(phases), phases)
@@ -238,7 +231,6 @@ def test_intervals_cover_a_landing_within_a_gap_that_does_not_stop_the_hand(gap)
 
 
 def sensed(p, sd_pressed=3e-6, sd_place=3e-5, seed=0, **others):
-    """A contact of known penetration, with noise."""
     rng = np.random.default_rng(seed)
     pressed = np.maximum(p, 0) + sd_pressed * rng.standard_normal(p.size)
     place = p + sd_place * rng.standard_normal(p.size)
@@ -304,7 +296,6 @@ SD_PRESSED, SD_PLACE = 3e-6, 2e-5
 
 
 def release(seed: int, slip: float | None = None) -> Change:
-    """A contact that ends between samples 5 and 6, relaxed; it slides where it is pressed by `slip` [m]."""
     rng = np.random.default_rng(seed)
     place = (5 - np.arange(12)) * 2e-4 + rng.uniform(0, 2e-4)
     pressed = np.where(np.arange(12) <= 5, np.maximum(place, 0), 0.0)

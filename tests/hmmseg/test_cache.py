@@ -11,6 +11,22 @@ import pytest
 from hmmseg import cache
 from hmmseg.cache import CacheWarning, cache_folder, keep, kept
 
+PROGRAM = """
+import sys
+from hmmseg.jaxconfig import configure, double_precision
+configure()
+import jax, jax.numpy as jnp
+jax.monitoring.register_event_listener(lambda event, **_: print(event) if "cache_" in event else None)
+print(double_precision(lambda: jax.jit(lambda x: (x * x).sum())(jnp.arange(5.0)))())
+"""
+FUNCTION = """
+from hmmseg.online.compiled import compiled
+@compiled
+def double(x):
+    return 2 * x
+print(double(1.5), sum(double.stats.cache_hits.values()))
+"""
+
 
 @pytest.fixture(autouse=True)
 def unsaid(monkeypatch):
@@ -59,16 +75,6 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(where, tmp_path, monke
     assert kept(folder / "one.json") is None and os.listdir(tmp_path) == ["a file"]
 
 
-PROGRAM = """
-import sys
-from hmmseg.jaxconfig import configure, double_precision
-configure()
-import jax, jax.numpy as jnp
-jax.monitoring.register_event_listener(lambda event, **_: print(event) if "cache_" in event else None)
-print(double_precision(lambda: jax.jit(lambda x: (x * x).sum())(jnp.arange(5.0)))())
-"""
-
-
 def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
 
@@ -89,15 +95,6 @@ def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp
         program.write_bytes(content)
     hit, said = run()
     assert programs and not hit and said.count("not as it was written") == 1 and run() == (True, "")
-
-
-FUNCTION = """
-from hmmseg.online.compiled import compiled
-@compiled
-def double(x):
-    return 2 * x
-print(double(1.5), sum(double.stats.cache_hits.values()))
-"""
 
 
 def test_functions_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):

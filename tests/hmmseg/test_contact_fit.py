@@ -91,13 +91,18 @@ def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
     return f, labels
 
 
-def test_edges_are_students_distribution_far_into_their_tails():
+def test_students_edges_are_exact_and_em_ends_at_the_maximum_of_the_evidence():
     z = np.array([-1e5, -60.0, -4.0, -0.3, 0.0, 0.3, 4.0, 60.0])
     np.testing.assert_allclose(log_student_below(z), stats.t.logcdf(z, TAIL), rtol=1e-12, atol=1e-15)
+    trials = recorded()
+    fit = learn_level(trials, 0.7, max_iterations=500, tolerance=1e-10)
+    assert fit.converged
+    best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
+    assert fit.model == pytest.approx(best.x, abs=1e-3)
+    assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.model), abs=1e-9)
 
 
 def features(num, **columns):
-    """Features of `num` samples, columns by name (scalar or array)."""
     blank = {name: np.zeros(num) for name in ("vx", "vy", "ay", "y", "d")}
     values = {name: np.broadcast_to(np.asarray(v, float), (num,)) for name, v in columns.items()
               if name != "force"}  # fmt: skip
@@ -175,30 +180,22 @@ def test_a_sample_without_values_says_nothing(state):
     np.testing.assert_allclose(score(f, state), np.zeros(3), atol=1e-12)
 
 
-def test_a_block_held_still_above_its_place_is_not_at_rest_on_it():
-    """However long it is held: it hangs by its weight, and 4 mm from where the block rests."""
+def test_a_block_held_still_above_its_place_hangs_by_its_weight_and_inertia():
     still = PARAMETERS.bias + np.array([2.0, 0.2, -2.0, 0.2])
     hover = features(200, force=still, d=0.019, y=0.014 + 0.4 * 2e-4)
     assert score(hover, ABOVE_GROUND).sum() > score(hover, ON_GROUND).sum() + 200
     unknown = replace(PARAMETERS, levels=({1: 0.014},))  # the level may have been learned from the hover
     learned = log_likelihoods(hover, step(ON_GROUND), unknown, 0)[:, 0]
     assert score(hover, ABOVE_GROUND).sum() > learned.sum()
-
-
-def test_a_block_that_is_pushed_on_the_ground_is_still_on_it():
-    resting = PARAMETERS.bias + np.array([2.0, 0.15, -2.0, 0.15])
-    pushed = features(10, force=resting, d=0.019, y=0.01 + 0.3 * 2e-4, vx=0.03)
-    assert score(pushed, ON_GROUND).sum() > score(pushed, ABOVE_GROUND).sum() + 20
-
-
-def test_weight_of_a_carried_block_includes_its_inertia():
     force = PARAMETERS.bias + np.array([2.0, 0.3, -2.0, 0.3])  # 0.6 N: 0.4 N at half a g upwards
     still, rising = (score(features(1, force=force, d=0.019, ay=a), ABOVE_GROUND)[0] for a in (0.0, 4.905))
     assert rising > still + 5
 
 
-def test_what_strays_on_its_support_stays_near_it():
-    """A bounce or a slip by 3 mm may be; a rise by 25 mm is neither, however its forces ring."""
+def test_what_strays_on_its_support_is_on_it_while_it_stays_near_it():
+    resting = PARAMETERS.bias + np.array([2.0, 0.15, -2.0, 0.15])
+    pushed = features(10, force=resting, d=0.019, y=0.01 + 0.3 * 2e-4, vx=0.03)
+    assert score(pushed, ON_GROUND).sum() > score(pushed, ABOVE_GROUND).sum() + 20
     ring = PARAMETERS.bias + np.array([2.0, -0.05, -2.0, -0.05])
     off = np.array([0.003, 0.025])
     moving = features(2, force=ring, d=0.019, y=0.01 - 0.1 * 2e-4 + off, vy=0.1)
@@ -241,12 +238,20 @@ def test_location_and_scale_maximise_the_weighted_student_likelihood():
     assert found == pytest.approx(np.exp(at_location.x), rel=0.02)
 
 
-def test_transitions_are_probabilities_with_the_mean_duration():
+def test_shares_are_the_mean_of_their_dirichlet_and_transitions_have_the_mean_duration():
     stay, advance = chain_of(np.array([0.25, 0.5, 0.25]), 200).bands
     np.testing.assert_allclose(np.exp(stay[:2]) + np.exp(advance), 1.0)
     np.testing.assert_allclose(np.exp(-advance), [50, 100])
     stay, advance = chain_of(np.array([1e-9, 1.0]), 5).bands
     assert np.isfinite(stay).all() and np.isfinite(advance).all()
+    rng = np.random.default_rng(5)
+    gammas = [rng.dirichlet(np.ones(4), size=n) * [1, 1, 1, 0] for n in (30, 50)]  # a subtask nobody saw
+    gammas = [g / g.sum(axis=1, keepdims=True) for g in gammas]
+    counts = sum(g.mean(axis=0) for g in gammas)
+    expected = stats.dirichlet(np.full(4, 1 / 4) + counts).mean()
+    found = mean_shares(gammas)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert found[3] > 0
 
 
 def check_recovery(found, trials):
@@ -290,19 +295,7 @@ def test_a_scale_is_not_learned_from_readings_that_rounding_makes_equal():
     assert _least_force([trial]) < 0.3 * PLANTED.noise
 
 
-def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():
-    rng = np.random.default_rng(5)
-    gammas = [rng.dirichlet(np.ones(4), size=n) * [1, 1, 1, 0] for n in (30, 50)]  # a subtask nobody saw
-    gammas = [g / g.sum(axis=1, keepdims=True) for g in gammas]
-    counts = sum(g.mean(axis=0) for g in gammas)
-    expected = stats.dirichlet(np.full(4, 1 / 4) + counts).mean()
-    found = mean_shares(gammas)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    assert found[3] > 0
-
-
 def learn_level(trials, start, **settings):
-    """EM of two unit-variance levels, the first known to be 0."""
     chain = Chain(np.log([STAY, 1.0]), np.log([1 - STAY]))
 
     def tables(level):
@@ -331,12 +324,3 @@ def recorded():
     rng = np.random.default_rng(0)
     return tuple(np.r_[rng.normal(size=before), rng.normal(2.0, 1.0, size=after)]
                  for before, after in ((3, 6), (4, 5), (6, 3), (2, 3)))  # fmt: skip
-
-
-def test_em_ends_at_the_maximum_of_the_evidence():
-    trials = recorded()
-    fit = learn_level(trials, 0.7, max_iterations=500, tolerance=1e-10)
-    assert fit.converged
-    best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
-    assert fit.model == pytest.approx(best.x, abs=1e-3)
-    assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.model), abs=1e-9)

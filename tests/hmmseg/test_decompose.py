@@ -45,7 +45,7 @@ def test_the_papers_states():
     assert found[2].constraints == ("finger1-block1", "finger2-block1") and found[4].constraints == ()
 
 
-def test_the_papers_table_1_names_its_signals():
+def test_physics_and_the_papers_table_1_name_what_each_subtask_tells():
     found = decompose(PAPER)
     signals = {i: {entry.name: evidence.signals(i) for entry, evidence in found.reveals(i)
                    if found.in_paper(i, entry)} for i in range(4)}  # fmt: skip
@@ -54,10 +54,6 @@ def test_the_papers_table_1_names_its_signals():
     above = {"weight": ("vertical forces",), "width": ("horizontal positions",), "friction": forces}
     assert signals == {0: {}, 1: on_ground, 2: above, 3: on_ground}
     assert ways(found, "block2", "height") == [(1, 3)]
-
-
-def test_physics_gives_width_on_the_ground_and_weight_only_above_it():
-    found = decompose(PAPER)
     assert ways(found, "block1", "width") == [(1,), (2,), (3,)] and ways(found, "block1", "weight") == [(2,)]
     assert ways(found, "block1", "friction") == [(1,), (2,), (3,)]
     assert {name: entry.kind for name, entry in found.properties["block1"].items()} == {
@@ -66,7 +62,7 @@ def test_physics_gives_width_on_the_ground_and_weight_only_above_it():
     }  # fmt: skip
 
 
-def test_tower_heights_take_several_moves():
+def test_tower_heights_take_several_moves_and_some_are_known_only_together():
     found = decompose(TOWER)
     rises = [{"b": -1, "c": -1}, {"c": -1}, {"b": 1}, {"b": 1, "c": 1}]
     assert height_equations(TOWER) == list(enumerate(rises)) and ways(found, "c", "height") == [(5, 7)]
@@ -74,9 +70,6 @@ def test_tower_heights_take_several_moves():
     short = decompose(BlockTask(TOWER.initial, TOWER.moves[:2]))
     assert ways(short, "b", "height") == [(1, 3, 5, 7)]  # b + c from the first move, c from the second
     assert short.properties["a"]["height"].evidence == ()
-
-
-def test_heights_known_only_together():
     found = decompose(BlockTask(TOWER.initial, TOWER.moves[:1]))
     reasons = {name: entries["height"].reason for name, entries in found.properties.items()}
     assert reasons == {"a": "no recorded move changes the height at which something rests by a's height",
@@ -86,7 +79,7 @@ def test_heights_known_only_together():
         assert found.properties["b"][name].reason == "no recorded move grips b"
 
 
-def test_a_slide():
+def test_a_slide_tells_friction_and_weight_together_or_friction_of_a_known_weight():
     found = decompose(SLIDE)
     assert [s.name for s in found.subtasks] == ["pregrasp", "pickup", "slide", "place", "release"]
     assert [s.state for s in found.subtasks][1:4] == ["hold-on-ground", "sliding-on-ground", "hold-on-ground"]
@@ -97,16 +90,13 @@ def test_a_slide():
         assert (evidence.subtasks, evidence.bound, evidence.condition) == ((2,), False, VARYING_LOAD)
         assert evidence.signals() == ("horizontal forces", "vertical forces")
     assert found.properties["a"]["width"].kind == "value"
-
-
-def test_a_slide_of_a_block_whose_weight_is_known():
     found = decompose(BlockTask({"a": GROUND}, (Move("a", GROUND), Move("a", GROUND, slide=True))))
     slid = [e for e in found.properties["a"]["friction_on_ground"].evidence if not e.bound]
     assert [(e.subtasks, e.given, e.condition) for e in slid] == [((6,), (("weight", "a"),), None)]
     assert ways(found, "a", "weight") == [(2,)]
 
 
-def test_repeats():
+def test_repeats_of_moves_and_unknowns_that_are_known():
     moves = (Move("a", "b"), Move("a", GROUND))
     twice = decompose(BlockTask({"a": GROUND, "b": GROUND}, moves, repeat=2))
     assert [s.move for s in twice.subtasks] == [0] + [m for m in range(4) for _ in range(4)]
@@ -115,14 +105,13 @@ def test_repeats():
     unknown = decompose(BlockTask({"a": GROUND, "b": GROUND}, moves, repeat="unknown"))
     assert len(unknown.subtasks) == 9
     assert unknown.notes == ("the moves repeat as often as the recording shows; one round is decomposed",)
+    both = {("weight", "a"): Fraction(1), ("load",): Fraction(-1), Source(0, "f"): Fraction(-1)}
+    assert determined([both]) == {} and set(determined([both], known=[("weight", "a")])) == {("load",)}
 
 
 @st.composite
 def block_tasks(draw):
-    """Arguments of tasks that can be performed, of up to four objects and six moves.
-
-    Plain data: the run-time type checker draws random numbers, which hypothesis forbids here.
-    """
+    """Plain arguments of tasks, as the type checker draws random numbers, which hypothesis forbids."""
     names = ["a", "b", "c", "d"][: draw(st.integers(1, 4))]
     support: dict[str, str] = {}
     for name in names:
@@ -184,7 +173,6 @@ def test_every_property_has_evidence_or_a_reason(arguments):
 
 
 def test_balance_agrees_with_the_jacobian_of_a_forward_model():
-    """One grasp each of a carry and a slide, measured at several instants, perturbed numerically."""
     weight, width, below, mu, grip1, grip2 = range(6)
     truth = np.array([0.4, 0.02, 0.015, 0.3, 0.008, 0.007])
 
@@ -240,8 +228,3 @@ def test_elimination_agrees_with_numerical_null_space(rows):
     for (_, name), row in found.items():  # its sources are the combination that leaves it alone
         combined = sum(float(c) * np.array(rows[source.subtask]) for source, c in row.items())
         np.testing.assert_allclose(combined, np.eye(5)[int(name)], atol=1e-12)
-
-
-def test_known_unknowns_are_given():
-    both = {("weight", "a"): Fraction(1), ("load",): Fraction(-1), Source(0, "f"): Fraction(-1)}
-    assert determined([both]) == {} and set(determined([both], known=[("weight", "a")])) == {("load",)}

@@ -27,7 +27,6 @@ PRIOR = (2.5e-4, 0.75e-4)
 
 
 def squeeze(step=0.02, compliance=2.5e-4):
-    """A grip that closes and then holds."""
     rng = np.random.default_rng(0)
     fine = np.arange(0, 0.8, 1e-4)
     force = 4 * np.clip(fine / 0.15, 0, 1) ** 1.5 + 0.3 * np.sin(9 * fine) * (fine > 0.15)
@@ -143,7 +142,6 @@ COMPLIANCE, WIDTH = 2.5e-4, 0.03
 
 
 def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE):
-    """Fingers that close on a block, hold it and open, their forces late by `delay` or filtered."""
     rng = np.random.default_rng(seed)
     fine = np.arange(0, 2.0, 1e-4)
     start = rng.uniform(0.3, 0.32)
@@ -192,7 +190,6 @@ def test_a_small_delay_is_found_and_is_no_sensor_s(delay):
 
 
 def half_a_grip(step, noise, sd_load, seed):
-    """Fingers that close on a block, or open if the seed is odd; no velocities."""
     rng, fine = np.random.default_rng(seed), np.arange(0, 1.0, 1e-4)
     way = np.clip((fine - 0.2) / 0.35, 0, 1)
     distance = (WIDTH + 0.01 - 0.0105 * way**3 * (10 - 15 * way + 6 * way**2))[:: (-1) ** seed]
@@ -240,7 +237,6 @@ SD = 2e-5
 
 
 def releases(toe=NONE, number=8, compliances=(1e-4,), seed=0):
-    """Loads from 10 N to none of grips that let go, and the fingers' distance."""
     rng = np.random.default_rng(seed)
     out = []
     for k in range(number):

@@ -29,11 +29,7 @@ FLATTENS = 0.03  # s in which a block that landed on its corner comes to lie fla
 
 
 def rolling_trial(number: int, angle: float, world: str = "50 Hz") -> tuple[Trial, Rig, np.ndarray]:
-    """A simulated trial with hand and block rolled by up to `angle` [rad] in carries, rig, boundaries [s].
-
-    The roll grows from lift to landing. The hand is higher by what the corner hangs lower, so that the
-    landing is when it was. Its roll stands in the column `hand_roll`, which may be left out.
-    """
+    """A trial whose hand and block roll by up to `angle` [rad] from lift to landing, rig, boundaries [s]."""
     (judged,) = trials_of(WORLDS[world], [number])
     s, b = task_space(judged.trial, judged.rig), judged.boundaries
     roll = np.zeros(s.t.size)
@@ -242,7 +238,7 @@ def test_thinning_averages_groups_and_their_noise():
     assert read.sd_force == pytest.approx(0.1 / np.sqrt(6))
 
 
-def test_thinning_skips_missing_values():
+def test_means_over_time_skip_missing_values():
     t = np.arange(8) / 80
     signals = made_signals(t, np.random.default_rng(2))
     signals.fy1[[0, 2, 3]] = np.nan
@@ -250,9 +246,6 @@ def test_thinning_skips_missing_values():
     np.testing.assert_allclose(thinned.fy1[0], signals.fy1[1])
     assert np.isnan(thinned.fy1[1])
     np.testing.assert_allclose(thinned.fy1[2:], signals.fy1[4:].reshape(2, 2).mean(axis=1))
-
-
-def test_acceleration_skips_missing_samples():
     t = np.array([0.0, 0.1, 0.25, 0.3, 0.5, 0.6])
     velocity = 3 * t**2 + 1
     np.testing.assert_allclose(acceleration(t, velocity)[1:-1], 6 * t[1:-1], rtol=1e-12)
@@ -264,7 +257,6 @@ def test_acceleration_skips_missing_samples():
 
 
 def test_noise_of_means_and_distances():
-    """Mean and distance of two fingers with independent noise s: s / sqrt(2) and s sqrt(2)."""
     rig = Rig(noise=Noise(position=3e-5, velocity=4e-3, force=0.01), fingertip=Fingertip())
     t = np.arange(40) * 0.05
     trial = Trial("made.csv", t, {name: np.sin(t) for name in CHANNELS})

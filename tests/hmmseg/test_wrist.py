@@ -27,16 +27,6 @@ def performed():
     return performances(2)
 
 
-def read_all(performed, setup, **said):
-    rig = wrist_rig(setup, **said)
-    return [read_trial(wrist_recording(s, setup, i), rig) for i, s in enumerate(performed)], rig
-
-
-def raw(simulated, setup, **said):
-    rig = wrist_rig(setup, **said)
-    return trial_of(frame_table(wrist_recording(simulated, setup), None), rig, None), rig
-
-
 @pytest.mark.parametrize(
     "name",
     ["as it is", "reaction, untared", "all said", "turning, untared", "world's axes, drifting",
@@ -44,7 +34,8 @@ def raw(simulated, setup, **said):
 )  # fmt: skip
 def test_blocks_and_boundaries_from_the_wrist_alone(performed, name):
     setup, said = SETUPS[name]
-    trials, rig = read_all(performed, setup, **said)
+    rig = wrist_rig(setup, **said)
+    trials = [read_trial(wrist_recording(s, setup, i), rig) for i, s in enumerate(performed)]
     aligned = align(trials, TASK, rig)
     errors = []
     for simulated, found in zip(performed, aligned.segmentations, strict=True):
@@ -65,7 +56,6 @@ def test_blocks_and_boundaries_from_the_wrist_alone(performed, name):
 
 @pytest.mark.parametrize("after", range(1, 6))
 def test_a_recording_may_end_as_it_grips(after):
-    """So few samples that the way of the touch is not all there."""
     t = np.arange(50) / 50
     opening = np.maximum(0.05 - 0.04 * np.maximum(t - 0.5, 0), 0.05 - 0.04 * (t[-after] - 0.5))
     (closing,) = closings(opening)
@@ -74,28 +64,19 @@ def test_a_recording_may_end_as_it_grips(after):
 
 
 def creeping_grip(creep):
-    """Time and opening of a gripper that closes on something within 1 s, holds it for 3 s, and opens again.
-
-    The opening creeps by so much [m] while it is held.
-    """
+    """Time and opening of a gripper that closes within 1 s, holds for 3 s while it creeps [m], and opens."""
     t = np.arange(0.0, 5.0, 0.01)
     way = np.clip(t, 0, 1) - np.clip(t - 4, 0, 1)
     shut = way**3 * (10 - 15 * way + 6 * way**2)
     return t, 0.08 - 0.03 * shut + creep * np.clip((t - 1) / 3, 0, 1) * (t < 4.0)
 
 
-def test_a_grip_ends_where_the_opening_passes_the_width():
-    """A hand that has opened by less than a tenth of its way counts as standing, but its pads may be off."""
+def test_a_grip_ends_where_the_opening_passes_the_width_however_slow_its_messages():
     t, opening = creeping_grip(0.0)
     (closing,) = closings(opening)
     grip = grip_of(t, opening, closing, 2.0, 4000.0)  # the pads give 1 mm
     assert opening[grip.start] <= grip.width < opening[grip.start - 1]
     assert opening[grip.stop - 1] <= grip.width < opening[grip.stop]
-
-
-def test_an_opening_between_slower_messages_shows_no_more_than_they_do():
-    """On lines between them there is no noise, against which theirs would show where the hand lets go."""
-    t, opening = creeping_grip(0.0)
     rows = np.arange(0.0, t[-1], 0.001)
     for seed in range(5):
         noisy = opening + np.random.default_rng(seed).normal(0, 1e-4, t.size)
@@ -133,7 +114,8 @@ def test_a_grip_force_tells_the_width_and_bounds_friction(performed):
 
 def test_the_tool_is_found_from_free_motion(performed):
     setup = Setup(mass=1.3, heading=0.5, tilt=0.15, offset=(4.0, -1.0, 2.0), reaction=True, noise=0.002)
-    trial, rig = raw(performed[0], setup)
+    rig = wrist_rig(setup)
+    trial = trial_of(frame_table(wrist_recording(performed[0], setup), None), rig, None)
     pose = pose_of(trial, rig.gripper)
     free = trial.t < 1.5
     tool = free_tool(trial, rig, pose, free)
@@ -162,7 +144,6 @@ def test_the_tool_is_found_where_forces_come_late(performed, late):
 
 
 def test_an_open_hand_at_rest_holds_nothing():
-    """It stands as wide open as the other block is for its first second, and forces tell little at 20 Hz."""
     setup = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))
     simulated = performances(1, seed=104)[0]
     trial = read_trial(wrist_recording(simulated, setup, 4), wrist_rig(setup))
@@ -176,7 +157,7 @@ def test_an_open_hand_at_rest_holds_nothing():
     assert np.abs([s.end for s in found.spans[:-1]] - simulated.boundaries).max() < 0.05
 
 
-def test_a_missing_sample_is_bridged(performed):
+def test_missing_samples_and_places_that_never_change_are_bridged(performed):
     columns = wrist_recording(performed[0], PLAIN)
     whole = read_trial(columns, wrist_rig(PLAIN))
     for name in ("gap", "pz", "Fz"):
@@ -185,6 +166,9 @@ def test_a_missing_sample_is_bridged(performed):
     holed = read_trial(columns, wrist_rig(PLAIN))
     assert np.isnan(holed.channels["fy1"][200:203]).all()
     assert np.nanmax(np.abs(holed.channels["fy1"] - whole.channels["fy1"])) < 0.1
+    usual = read_trial(columns, wrist_rig(PLAIN))
+    still = read_trial(columns | {"px": np.full_like(columns["px"], 0.5)}, wrist_rig(PLAIN))
+    np.testing.assert_allclose(still.channels["fy1"], usual.channels["fy1"], atol=0.05)
 
 
 @pytest.mark.parametrize(("setup", "said", "change", "line"), [
@@ -208,13 +192,6 @@ def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line
     assert "\n" not in str(told.value)
 
 
-def test_a_place_that_never_changes_is_an_axis_without_motion(performed):
-    columns = wrist_recording(performed[0], PLAIN)
-    usual = read_trial(columns, wrist_rig(PLAIN))
-    still = read_trial(columns | {"px": np.full_like(columns["px"], 0.5)}, wrist_rig(PLAIN))
-    np.testing.assert_allclose(still.channels["fy1"], usual.channels["fy1"], atol=0.05)
-
-
 @pytest.mark.parametrize("step", [4e-4, 1e-3])
 def test_an_opening_in_coarse_steps_leaves_widths_uncertain_and_not_wrong(performed, step):
     columns = wrist_recording(performed[0], PLAIN)
@@ -226,8 +203,12 @@ def test_an_opening_in_coarse_steps_leaves_widths_uncertain_and_not_wrong(perfor
         assert abs(width.mean() - block.width) < 3 * width.std()
 
 
-def test_the_lift_tells_the_sign_where_readings_change_with_the_pose(performed):
-    """Readings that grow along the way look like an inertia of the other sign."""
+def test_touches_are_told_and_the_lift_tells_the_sign_of_readings_that_change_with_the_pose(performed):
+    columns = wrist_recording(performed[0], PLAIN)
+    pressed = (columns["t"] > 1.2) & (columns["t"] < 1.5)
+    columns["Fz"] = columns["Fz"] - np.where(pressed, -2.0, 0.0)
+    notes = read_trial(columns, wrist_rig(PLAIN)).notes
+    assert any("the hand touches something from 1.2" in note for note in notes)
     setup = Setup(frame="world")
     columns = wrist_recording(performed[0], setup)
     for axis in "xyz":
@@ -240,14 +221,6 @@ def test_the_lift_tells_the_sign_where_readings_change_with_the_pose(performed):
     np.testing.assert_allclose(trials[0].channels["fy1"], trials[1].channels["fy1"])
     with pytest.raises(InputError, match=r"pulls up .*expected reaction = false under"):
         read_trial(columns, wrist_rig(setup, reaction=True))
-
-
-def test_a_touch_in_free_motion_is_told(performed):
-    columns = wrist_recording(performed[0], PLAIN)
-    pressed = (columns["t"] > 1.2) & (columns["t"] < 1.5)
-    columns["Fz"] = columns["Fz"] - np.where(pressed, -2.0, 0.0)
-    notes = read_trial(columns, wrist_rig(PLAIN)).notes
-    assert any("the hand touches something from 1.2" in note for note in notes)
 
 
 def test_halves_of_a_wrist_are_no_fingers(performed):

@@ -40,7 +40,6 @@ def made(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def one(made):
-    """What one worker finds."""
     return segmented(made, "--workers", "1")
 
 
@@ -59,11 +58,18 @@ def segmented(lab, *arguments, trials="many"):
     return json.loads((lab / "out.json").read_text())
 
 
-def test_digits_do_not_depend_on_who_works(lab, one):
+def test_digits_depend_neither_on_who_works_nor_on_the_order_of_a_set_of_names(lab, one):
     assert segmented(lab, "--workers", "2") == one
     assert [Path(t["file"]).as_posix() for t in one["trials"]] == [f"many/{i}.csv" for i in range(6)]
     alone = segmented(lab, trials="many/5.csv")["trials"]  # as without workers
     assert alone == one["trials"][5:]
+    found = set()
+    for seed in ("0", "1"):
+        command = [sys.executable, "-m", "hmmseg_cli.main", "segment", "many/0.csv", "--task", "task.toml",
+                   "--rig", "rig.toml", "--json", "-", "--quiet"]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONHASHSEED": seed})
+        found.add(done.stdout)
+    assert len(found) == 1
 
 
 def test_a_cluster_finds_the_same(lab, one):
@@ -95,13 +101,10 @@ def test_refusals(lab, more, said, capfd, monkeypatch):
     assert said in capfd.readouterr().err
 
 
-def test_plain_sequences_are_pooled(lab, capfd):
+def test_a_folder_stands_for_its_recordings_and_plain_sequences_are_pooled(lab, capfd, tmp_path):
     (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')
     assert main(["segment", "many", "--task", "order.toml", "--workers", "2"]) == 2
     assert "go with tasks of blocks alone" in capfd.readouterr().err
-
-
-def test_a_folder_stands_for_its_recordings(tmp_path):
     for name in ("b.csv", "a.CSV", "rig.toml", "c.npz"):
         (tmp_path / name).touch()
     (tmp_path / "inner").mkdir()
@@ -109,17 +112,6 @@ def test_a_folder_stands_for_its_recordings(tmp_path):
     assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
     with pytest.raises(InputError, match="no recordings in this folder"):
         recordings_in([tmp_path / "inner"])
-
-
-def test_the_order_of_a_set_of_names_moves_no_digit(lab):
-    """Python's hashes of names differ from process to process, and with them the order of sets."""
-    found = set()
-    for seed in ("0", "1"):
-        command = [sys.executable, "-m", "hmmseg_cli.main", "segment", "many/0.csv", "--task", "task.toml",
-                   "--rig", "rig.toml", "--json", "-", "--quiet"]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONHASHSEED": seed})
-        found.add(done.stdout)
-    assert len(found) == 1
 
 
 class Deadly(Executor):

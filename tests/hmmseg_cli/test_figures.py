@@ -58,14 +58,11 @@ def check_picture(path) -> None:
     assert min(picture.shape[:2]) > 200 and np.std(picture[..., :3]) > 0.02
 
 
-def test_signals_with_subtasks_names_and_legend(tmp_path, texts):
+def test_signals_show_subtasks_and_where_a_trial_failed(tmp_path, texts):
     path = tmp_path / "signals.png"
     draw_signals(make_signals(), make_segmentation(), path)
     check_picture(path)
     assert {"pregrasp block", "carry block", "hold-above-ground", "Grip\n[N]", "Mean $x$\n[cm]"} <= set(texts)
-
-
-def test_failed_trial_with_missing_samples_says_where(tmp_path, texts):
     segmentation = make_segmentation()
     failed = replace(segmentation, spans=segmentation.spans[:1], failed=Failure(1, "pickup", "block", "none"))
     gappy = replace(make_signals(), fx1=np.where(np.arange(100) % 2, np.nan, 1.0), x1=np.full(100, np.nan))
@@ -84,7 +81,7 @@ def test_channels_of_a_plain_task_up_to_what_is_legible(tmp_path, texts):
     assert any("3 more channels not shown" in text for text in texts)
 
 
-def test_corner_shows_cm_and_measured_values(tmp_path, texts):
+def test_corners_show_cm_and_predictions_their_coverage(tmp_path, texts):
     draws = np.random.default_rng(0).normal([0.343, 0.0159, 0.016], [1e-3, 1e-4, 1e-4], (2000, 3))
     actual = {"block1": {"weight": (0.5, 0.001), "width": (0.0159, 0.0001)}}
     draw_corner(draws, NAMES, tmp_path / "corner.png", actual)
@@ -93,17 +90,6 @@ def test_corner_shows_cm_and_measured_values(tmp_path, texts):
     assert "measured 0.5" in texts  # too far off to be a line
     draw_corner(draws[:, :1], NAMES[:1], tmp_path / "one.png")
     check_picture(tmp_path / "one.png")
-
-
-@pytest.mark.parametrize("actual", [None, {"block1": {"weight": (0.343, 0.0005), "width": (0.0159, 0.0001)}}])
-def test_estimates_with_null_and_bounded_properties(tmp_path, texts, actual):
-    draw_estimates(PROPERTIES, actual, tmp_path / "estimates.png")
-    check_picture(tmp_path / "estimates.png")
-    assert {" not determined ", " lower bound only ", "≥ 0.50", "block1 weight"} <= set(texts)
-    assert ("0.350 ± 0.010 N" if actual is None else "0.350 ± 0.010 N  (0.3430)") in texts
-
-
-def test_predictive_band_and_its_coverage(tmp_path, texts):
     low = np.where(T > 2.5, np.nan, -0.5)
     prediction = Prediction("Net $f_y$ [N]", np.sin(T), low, low + 1.0)
     there = T <= 2.5
@@ -113,3 +99,11 @@ def test_predictive_band_and_its_coverage(tmp_path, texts):
     draw_predictive(T, [prediction, nothing], tmp_path / "predictive.png", make_segmentation())
     check_picture(tmp_path / "predictive.png")
     assert sum(text.endswith("% inside") for text in texts) == 1
+
+
+@pytest.mark.parametrize("actual", [None, {"block1": {"weight": (0.343, 0.0005), "width": (0.0159, 0.0001)}}])
+def test_estimates_with_null_and_bounded_properties(tmp_path, texts, actual):
+    draw_estimates(PROPERTIES, actual, tmp_path / "estimates.png")
+    check_picture(tmp_path / "estimates.png")
+    assert {" not determined ", " lower bound only ", "≥ 0.50", "block1 weight"} <= set(texts)
+    assert ("0.350 ± 0.010 N" if actual is None else "0.350 ± 0.010 N  (0.3430)") in texts

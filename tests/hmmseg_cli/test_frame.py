@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import hmmseg
 from hmmseg.errors import InputError
@@ -29,12 +30,22 @@ def task(tmp_path) -> Path:
     return path
 
 
-def test_process_at_fault_says_one_line_and_exits_with_2(tmp_path):
+def test_processes_say_one_line_of_bad_input_and_show_the_traceback_of_a_bug(tmp_path, task):
     (tmp_path / "bad.toml").write_text(TASK.replace('to = "ground"', 'to = "table"'))
     done = run("decompose", "bad.toml", "--json", "out.json", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("bad.toml: move 1: unknown destination 'table'; expected one of block1, ")
     assert done.stderr.count("\n") == 1 and os.listdir(tmp_path) == ["bad.toml"]
+    code = """if True:
+        import sys
+        import hmmseg.contact.decompose
+        from hmmseg_cli import main
+        hmmseg.contact.decompose.decompose = lambda task: 1 / 0
+        sys.exit(main.main(["decompose", sys.argv[1]]))
+    """
+    done = subprocess.run([sys.executable, "-c", code, task], capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.startswith("Traceback")
+    assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
 
 
 def test_light_commands_do_not_import_heavy_modules():
@@ -44,10 +55,20 @@ def test_light_commands_do_not_import_heavy_modules():
     assert done.stdout == "[]\n"
 
 
-def test_version_and_help(capsys):
+def test_version_and_help_with_groups_and_examples(capsys):
     assert frame.main(["--version"]) == 0 and capsys.readouterr().out == f"{hmmseg.__version__}\n"
     for args in ([], ["--help"], ["-h"]):
         assert frame.main(args) == 0 and "decompose" in capsys.readouterr().out
+    assert frame.main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"{group}:" in out for group in frame.COMMANDS) and "Commands:" not in out
+    for group in frame.COMMANDS.values():
+        for command, example in group.items():
+            assert frame.main([command.__name__, "--help"]) == 0
+            shown = capsys.readouterr().out
+            assert example.splitlines()[-1] in shown
+            random = command.__name__ in ("identify", "simulate", "diagnose", "play", "demo")
+            assert ("--seed" in shown) == random
 
 
 @pytest.mark.parametrize(("args", "line"), [
@@ -80,41 +101,11 @@ def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
     rig.write_text('[columns]\nt = {from = "time"}\n')  # but how its files are read, as inspect writes it
     assert find_inputs([trial], other, None) == (other, rig)
     rig.write_text(hand)
-    with pytest.raises(InputError, match=r"--task .*rig.toml: describes no task; .*swapped\?"):
-        find_inputs([trial], rig, task)
-    with pytest.raises(InputError, match=r"--rig .*other.toml: describes a task"):
-        find_inputs([trial], task, other)
+    refused(r"--task .*rig.toml: describes no task; .*swapped\?", find_inputs, [trial], rig, task)
+    refused(r"--rig .*other.toml: describes a task", find_inputs, [trial], task, other)
     task.unlink()
-    with pytest.raises(InputError, match=r"--task: missing; expected .*or a task.toml in"):
-        find_inputs([trial], None, None)
-    with pytest.raises(InputError, match="--rig: missing"):
-        require_rig(None, [trial])
-
-
-def test_help_groups_commands_and_gives_examples(capsys):
-    assert frame.main(["--help"]) == 0
-    out = capsys.readouterr().out
-    assert all(f"{group}:" in out for group in frame.COMMANDS) and "Commands:" not in out
-    for group in frame.COMMANDS.values():
-        for command, example in group.items():
-            assert frame.main([command.__name__, "--help"]) == 0
-            shown = capsys.readouterr().out
-            assert example.splitlines()[-1] in shown
-            random = command.__name__ in ("identify", "simulate", "diagnose", "play", "demo")
-            assert ("--seed" in shown) == random
-
-
-def test_a_process_with_a_bug_shows_its_traceback(task):
-    code = """if True:
-        import sys
-        import hmmseg.contact.decompose
-        from hmmseg_cli import main
-        hmmseg.contact.decompose.decompose = lambda task: 1 / 0
-        sys.exit(main.main(["decompose", sys.argv[1]]))
-    """
-    done = subprocess.run([sys.executable, "-c", code, task], capture_output=True, text=True, check=False)
-    assert done.returncode == 1 and done.stderr.startswith("Traceback")
-    assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
+    refused(r"--task: missing; expected .*or a task.toml in", find_inputs, [trial], None, None)
+    refused("--rig: missing", require_rig, None, [trial])
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
@@ -128,22 +119,28 @@ def test_a_process_with_a_bug_shows_its_traceback(task):
 def test_destinations_are_checked_beforehand(tmp_path, arguments, message):
     (tmp_path / "file").write_text("")
     given = {name: value.format(tmp_path) for name, value in arguments.items()}
-    with pytest.raises(InputError, match=f"^{message}"):
-        Output("test", json=given.get("json"),
-               figures=Path(given["figures"]) if "figures" in given else None,
-               report=Path(given["report"]) if "report" in given else None)  # fmt: skip
+    refused(f"^{message}", Output, "test", json=given.get("json"), figures=Path(given["figures"])
+            if "figures" in given else None, report=Path(given["report"]) if "report" in given
+            else None)  # fmt: skip
 
 
-def test_destinations_without_permission(tmp_path, monkeypatch):
+def test_destinations_are_links_and_devices_but_none_without_permission(tmp_path, monkeypatch):
     (tmp_path / "a.json").write_text("old")
     monkeypatch.setattr("hmmseg_cli.console.os.access", lambda path, mode: False)  # root may write anywhere
     for arguments in ({"json": str(tmp_path / "a.json")}, {"json": str(tmp_path / "b.json")},
                       {"report": tmp_path / "c.html"}, {"figures": tmp_path / "d"}):  # fmt: skip
-        with pytest.raises(InputError, match="cannot be written"):
-            Output("test", **arguments)
+        refused("cannot be written", Output, "test", **arguments)
+    (tmp_path / "real.json").write_text("old")
+    (tmp_path / "link.json").symlink_to("real.json")
+    for name in (str(tmp_path / "link.json"), os.devnull):
+        with Output("test", json=name, quiet=True) as out:
+            out.finish({})
+    assert (tmp_path / "link.json").is_symlink()
+    assert json.loads((tmp_path / "real.json").read_text())["format"] == "hmmseg.test/1"
+    assert Path(os.devnull).is_char_device()
 
 
-def test_files_appear_together_at_the_end(tmp_path):
+def test_files_appear_together_at_the_end_or_not_at_all(tmp_path):
     with Output("test", json=str(tmp_path / "a.json"), figures=tmp_path / "new/figures",
                 report=tmp_path / "r.html", quiet=True) as out:  # fmt: skip
         out.warn("beware")
@@ -169,18 +166,7 @@ def test_a_failure_leaves_everything_as_it_was(tmp_path):
     assert (tmp_path / "a.json").read_text() == "old" and os.listdir(tmp_path) == ["a.json"]
 
 
-def test_links_and_devices_are_written_through(tmp_path):
-    (tmp_path / "real.json").write_text("old")
-    (tmp_path / "link.json").symlink_to("real.json")
-    for name in (str(tmp_path / "link.json"), os.devnull):
-        with Output("test", json=name, quiet=True) as out:
-            out.finish({})
-    assert (tmp_path / "link.json").is_symlink()
-    assert json.loads((tmp_path / "real.json").read_text())["format"] == "hmmseg.test/1"
-    assert Path(os.devnull).is_char_device()
-
-
-def test_standard_output_is_kept_clean(capsys):
+def test_standard_output_is_kept_clean_and_quiet(capsys):
     with Output("test", json="-") as out:
         out.print("to people")
         print("a stray print")
@@ -191,9 +177,6 @@ def test_standard_output_is_kept_clean(capsys):
     printed = capsys.readouterr()
     assert json.loads(printed.out)["value"] is None and "to people\n" in printed.err
     assert "a stray print\n" in printed.err and "warning: beware\n" in printed.err
-
-
-def test_quiet(capsys):
     with Output("test", quiet=True) as out:
         out.print("to people")
         out.warn("beware")
@@ -216,9 +199,6 @@ def test_distinct_trials(tmp_path):
         path.write_text(text)
     assert distinct_trials(paths[:2]) == paths[:2]
     for twice in ([paths[0], paths[0]], [paths[0], tmp_path / "." / "a.csv"], [paths[0], paths[2]]):
-        with pytest.raises(InputError, match=r"csv: the same trial as .*a\.csv; expected every trial once"):
-            distinct_trials(twice)
-    with pytest.raises(InputError, match=r"absent\.csv: no such file; expected a trial"):
-        distinct_trials([tmp_path / "absent.csv"])
-    with pytest.raises(InputError, match="is a folder; expected a trial"):
-        distinct_trials([tmp_path])
+        refused(r"csv: the same trial as .*a\.csv; expected every trial once", distinct_trials, twice)
+    refused(r"absent\.csv: no such file; expected a trial", distinct_trials, [tmp_path / "absent.csv"])
+    refused("is a folder; expected a trial", distinct_trials, [tmp_path])

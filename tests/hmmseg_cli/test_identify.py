@@ -90,7 +90,7 @@ def test_identify_draws_figures_and_one_self_contained_page(identified):
     assert 'src="http' not in page and 'href="http' not in page
 
 
-def test_what_the_task_cannot_tell_is_null_with_the_reason(tmp_path):
+def test_what_a_task_cannot_tell_or_does_not_name_is_said(tmp_path):
     task, folder = tmp_path / "task.toml", tmp_path / "made"
     task.write_text(SINGLE)
     rig = str(NONE / "rig.toml")
@@ -100,10 +100,18 @@ def test_what_the_task_cannot_tell_is_null_with_the_reason(tmp_path):
     assert found["trials"][0]["complete"] and found["warnings"] == []
     assert found["properties"]["block1"]["height"] is None and found["reasons"]["block1.height"]
     assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.343, rel=0.03)
+    task, trial = tmp_path / "task.toml", tmp_path / "trial.csv"
+    task.write_text(SINGLE)  # but the recorded block comes down from another, 12.5 mm
+    cut = pd.read_csv(NONE / "trial_01.csv")
+    cut[cut.t < 5.5].to_csv(trial, index=False)
+    found = document("identify", str(trial), "--task", str(task), "--rig", str(NONE / "rig.toml"),
+                     out=tmp_path / "o.json")  # fmt: skip
+    assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.57789, rel=0.03)
+    (warning,) = found["warnings"]
+    assert warning.startswith("block1 was lowered by 12.5 mm")
 
 
 def test_sums_stand_where_their_terms_do_not(tmp_path):
-    """Three blocks restacked show only sums of heights; a block that only slides shows no weight."""
     true = {"a": (0.4, 0.04, 0.03), "b": (0.9, 0.05, 0.025), "c": (1.4, 0.06, 0.04)}
     units = {"weight": "N", "width": "m", "height": "m"}
     entries = ((o, *entry) for o, own in true.items() for entry in zip(units.items(), own, strict=True))
@@ -135,26 +143,11 @@ def test_sums_stand_where_their_terms_do_not(tmp_path):
     assert found["pushed"]["reasons"]["b.weight"] == "no subtask of this task lifts b"
 
 
-def test_an_object_that_the_task_does_not_name_is_said(tmp_path):
-    task, trial = tmp_path / "task.toml", tmp_path / "trial.csv"
-    task.write_text(SINGLE)  # but the recorded block comes down from another, 12.5 mm
-    cut = pd.read_csv(NONE / "trial_01.csv")
-    cut[cut.t < 5.5].to_csv(trial, index=False)
-    found = document("identify", str(trial), "--task", str(task), "--rig", str(NONE / "rig.toml"),
-                     out=tmp_path / "o.json")  # fmt: skip
-    assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.57789, rel=0.03)
-    (warning,) = found["warnings"]
-    assert warning.startswith("block1 was lowered by 12.5 mm")
-
-
-def test_the_papers_method_has_no_evidence_and_its_own_formulas(tmp_path):
+def test_rigs_without_stiffness_and_the_papers_method_say_what_they_lack(tmp_path):
     trial = str(NONE / "trial_02.csv")
     found = document("identify", trial, *RIG_AND_TASK, "--method", "paper", out=tmp_path / "out.json")
     assert found["method"] == "paper" and found["trials"][0]["log_evidence"] is None
     assert found["properties"]["block1"]["width"]["mean"] < 0.0185  # short by what the pads give
-
-
-def test_a_rig_that_states_no_stiffness_is_not_said_to_state_rigid_pads(tmp_path):
     rig = tmp_path / "rig.toml"
     text = (NONE / "rig.toml").read_text()
     rig.write_text(re.sub(r"(?m)^(normal|shear)_stiffness.*$", "", text))
@@ -220,7 +213,6 @@ def test_plain_ordered_task_fits_saves_and_segments(tmp_path):
 @pytest.fixture
 def decomposed(tmp_path, capsys, monkeypatch):
     """Run the command on a task's text; returns its document and what people see."""
-
     monkeypatch.setenv("COLUMNS", "120")
 
     def run(text: str) -> tuple[dict, str]:
@@ -233,7 +225,7 @@ def decomposed(tmp_path, capsys, monkeypatch):
     return run
 
 
-def test_equation_1_of_the_paper(decomposed):
+def test_the_papers_equation_1_and_its_document(decomposed):
     document, printed = decomposed(PAPER)
     assert document["equation"].split(",\n      ") == [
         "T = { Pregrasp 1 = (free-motion, {∅})",
@@ -251,9 +243,6 @@ def test_equation_1_of_the_paper(decomposed):
     (row,) = (line for line in printed.splitlines() if "│ carry block1" in line)
     cells = [cell.strip() for cell in row.split("│")]
     assert cells[3:7] == ["hold-above-ground", "vertical", "horizontal", ""]
-
-
-def test_document_of_the_paper(decomposed):
     document, _ = decomposed(PAPER)
     assert document["minimal"] == list(range(9))
     assert document["height_equations"] == [{"move": 1, "rise": {"block2": -1}},
@@ -274,7 +263,7 @@ def test_document_of_the_paper(decomposed):
                                        "given": [], "condition": None}]}  # fmt: skip
 
 
-def test_names_reasons_and_notes(decomposed):
+def test_names_reasons_and_notes_of_blocks_and_of_a_plain_sequence(decomposed):
     document, printed = decomposed(
         'repeat = "unknown"\n[objects.cup]\non = "ground"\n[objects.lid]\non = "ground"\n'
         '[[moves]]\nobject = "cup"\nto = "ground"\nslide = true\n'
@@ -287,9 +276,6 @@ def test_names_reasons_and_notes(decomposed):
     assert document["properties"]["cup"]["friction_on_ground"]["kind"] == "value"
     assert document["repeat"] == "unknown" and "one round is decomposed" in printed
     assert "lid.weight: no recorded move grips lid" in printed
-
-
-def test_plain_ordered_task(decomposed):
     document, printed = decomposed('sequence = ["approach", "mating"]')
     assert document["equation"] == "T = { approach = (approach, {∅}),\n      mating = (mating, {∅}) }"
     assert document["properties"] == {}

@@ -1,7 +1,4 @@
-"""What a machine or its user may do to a command: refuse a file, lose a reader, fill a disk, press Ctrl-C.
-
-Always one line and exit 2 (or 130), or the whole result; never a traceback or half a file.
-"""
+"""Whatever a machine or its user does to a command: one line and exit 2 or 130, or the whole result."""
 
 import builtins
 import contextlib
@@ -155,11 +152,10 @@ def test_whatever_call_is_refused(name, kind, lab, monkeypatch, capsys):
 @pytest.mark.parametrize("kind", CALLS)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_whichever_call_is_refused(name, kind, lab, monkeypatch, capsys):
-    """Every call of every command."""
     tortured(lab, name, kind, monkeypatch, capsys, COSTLY.get(name, 10_000))
 
 
-def test_a_rename_that_is_refused_leaves_results_of_before(lab, monkeypatch, capsys):
+def test_whatever_the_machine_refuses_results_of_before_stay_and_folders_are_named(lab, monkeypatch, capsys):
     assert main(COMMANDS["fit"]) == 0
     before = files(lab)
     real = os.replace
@@ -167,6 +163,13 @@ def test_a_rename_that_is_refused_leaves_results_of_before(lab, monkeypatch, cap
         patched.setattr(os, "replace", Refusing(real, FULL, 1, lambda new, to: ".old" not in str(new)))
         assert main([*COMMANDS["fit"], "--seed", "3"]) == 2
     assert files(lab) == before and "cannot be written (No space left on device)" in capsys.readouterr().err
+    monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)
+    assert main(["decompose", "task.toml", "--json", "out.json"]) == 2
+    assert capsys.readouterr().err.startswith(f"--json out.json: {lab} cannot be written to")
+    assert main(["demo"]) == 2
+    assert capsys.readouterr().err.startswith(f"--report demo/report.html: {lab} cannot be written")
+    monkeypatch.setattr(tempfile, "tempdir", str(lab / "nowhere"))
+    assert main(COMMANDS["decompose"]) == 2 and "temporary files: cannot be used" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("stdout", ["closed", "full", "gone"])
@@ -188,15 +191,7 @@ def test_without_a_reader_of_json_a_line_says_so(lab):
     assert run.returncode == 2 and run.stderr.startswith("standard output: cannot be written to (No space")
 
 
-def test_a_folder_that_refuses_files_is_named_with_the_file(lab, monkeypatch, capsys):
-    monkeypatch.setattr(os, "access", lambda _, mode: not mode & os.W_OK)
-    assert main(["decompose", "task.toml", "--json", "out.json"]) == 2
-    assert capsys.readouterr().err.startswith(f"--json out.json: {lab} cannot be written to")
-    assert main(["demo"]) == 2
-    assert capsys.readouterr().err.startswith(f"--report demo/report.html: {lab} cannot be written")
-
-
-def test_names_may_hold_what_a_file_system_allows(lab, capsys):
+def test_odd_names_and_no_home_do_no_harm(lab, capsys, monkeypatch):
     odd = os.fsdecode(b"caf\xe9\x1b[31m.csv")
     shutil.copyfile("trial.csv", odd)
     assert main(["segment", odd, *HAND, "--method", "qualitative", "--json", "out.json"]) == 0
@@ -208,14 +203,6 @@ def test_names_may_hold_what_a_file_system_allows(lab, capsys):
     for name in ("a" * 251 + ".json", "\0.json"):
         assert main(["decompose", "task.toml", "--json", name]) == 2
     assert main(["segment", "b" * 252 + ".csv", *HAND]) == 2
-
-
-def test_without_a_temporary_folder_a_line_says_so(lab, monkeypatch, capsys):
-    monkeypatch.setattr(tempfile, "tempdir", str(lab / "nowhere"))
-    assert main(COMMANDS["decompose"]) == 2 and "temporary files: cannot be used" in capsys.readouterr().err
-
-
-def test_nothing_is_written_into_the_package_and_no_home_is_needed(lab, monkeypatch):
     packages = [Path(sys.modules[n].__file__).parent for n in ("hmmseg", "hmmseg_cli")]
 
     def content():
@@ -367,7 +354,6 @@ def sent(command, moment, stdin=None):
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", [4.0, 9.0, 14.0, 21.0, 30.0, 45.0])
 def test_ctrl_c_while_diagnosing(moment, lab):
-    """Whole or not there, and no traceback, wherever in the search for causes it comes."""
     before = files(lab)
     trials = ["trial.csv", "trial_2.csv", "trial_3.csv"]
     _, err, code = sent(["diagnose", *trials, *HAND, "--json", "out.json", "--report", "gap.html"], moment)
@@ -379,7 +365,6 @@ def test_ctrl_c_while_diagnosing(moment, lab):
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", [3.0, 5.0, 8.0, 12.0])
 def test_ctrl_c_while_watching(moment, lab):
-    """Every line is whole, the last one says so, and the document is there or not."""
     before = files(lab)
     rows = (lab / "trial.csv").read_text().splitlines(keepends=True)
     read, write = os.pipe()
@@ -396,7 +381,6 @@ def test_ctrl_c_while_watching(moment, lab):
 
 
 def _feed(write, rows):
-    """Rows into a pipe at the robot's pace, until nobody reads them."""
     with contextlib.suppress(BrokenPipeError), os.fdopen(write, "w") as pipe:
         for row in rows:
             pipe.write(row)

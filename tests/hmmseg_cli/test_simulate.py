@@ -44,7 +44,6 @@ def test_trials_are_written_as_a_folder_of_recordings(tmp_path, inputs):
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {
         "trial_01_signals.png", "trial_02_signals.png"}  # fmt: skip
     assert all((tmp_path / name).exists() for name in document["files"])
-
     again = tmp_path / "again"
     assert main([*args[:-4], "--output", str(again), "--json", str(report)]) == 0
     assert (again / "trial_02.csv").read_bytes() == (out / "trial_02.csv").read_bytes()

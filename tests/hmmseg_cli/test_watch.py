@@ -58,7 +58,7 @@ def test_bad_input_gets_one_line(run, change, message):
     assert code == 2 and len(err.splitlines()) == 1 and message in err
 
 
-def test_angles_in_degrees_are_refused_as_in_a_file(run):
+def test_degrees_and_ms_are_refused_as_in_a_file(run):
     cells = [row.split(",") for row in ROWS[1:110]]
     angles = [k for k, name in enumerate(ROWS[0].split(",")) if name[0] in "qd"]
     rows = [",".join(str(57.3 * float(c)) if k in angles else c for k, c in enumerate(row)) for row in cells]
@@ -66,9 +66,6 @@ def test_angles_in_degrees_are_refused_as_in_a_file(run):
     assert code == 2 and "it looks like deg; expected q" in err
     wild = [*ROWS[:60], ",".join([ROWS[60].split(",")[0], *["999"] * 12]), *ROWS[61:110]]
     assert run(wild)[0] == 0  # a single row is no unit
-
-
-def test_times_in_ms_are_refused_as_in_a_file(run):
     cells = [row.split(",", 1) for row in ROWS[1:110]]
     rows = [f"{1e3 * float(t):g},{rest}" for t, rest in cells]
     code, _, err = run([ROWS[0], *rows])
@@ -77,7 +74,6 @@ def test_times_in_ms_are_refused_as_in_a_file(run):
 
 
 def test_a_stream_as_a_spreadsheet_has_it(run):
-    """Semicolons, decimal commas, remarks, a row of units and ISO stamps: the answers of the plain stream."""
     plain = run(ROWS[:60])[1]
     table = [row.split(",") for row in ROWS[:60]]
     units = ["" if name == "t" else "N" if name[0] == "f" else "rad/s" if name[0] == "d" else "rad"
@@ -102,14 +98,10 @@ def test_a_rig_without_pads_is_told(run, tmp_path, left_out):
     assert code == 0 and any("states no [fingertip]" in line for line in lines[-1]["warnings"])
 
 
-def test_bad_rows_can_be_left_out(run):
+def test_bad_rows_and_one_that_breaks_off_can_be_left_out(run):
     rows = [*ROWS[:5], "garbage", *ROWS[5:20]]
     code, lines, err = run(rows, "--skip-bad-rows")
     assert code == 0 and len(lines) == 20 and "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
-
-
-def test_a_stream_that_ends_in_the_middle_of_a_row(run):
-    """As a file that does: the row is left out with a warning, and the last line is written."""
     code, lines, err = run([*ROWS[:20], ROWS[20][:30]], end="")
     assert code == 0 and len(lines) == 20 and lines[-1]["final"] and lines[-1]["counts"]["rows"] == 19
     assert lines[-1]["warnings"] == ["standard input: row 21, the last, is cut off and left out"]

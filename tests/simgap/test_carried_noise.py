@@ -7,7 +7,6 @@ import pytest
 from demo_recordings import recorded
 
 from hmmseg.io.trial import Trial
-from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms, of_noise, products
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines, spectrum
@@ -22,8 +21,7 @@ GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
 
 
 def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
-    """A place that a force moves through a pad, place = (GIVE + true) force, both with noise; the effect is
-    another give. `swing`: sd of the true force; `error`: sd of what moves the place besides."""
+    """A place that a force moves, place = (GIVE + true) force, with noise; the effect is another give."""
     rng = np.random.default_rng(seed)
     n = TRIALS * SAMPLES
     trial, k = np.divmod(np.arange(n), SAMPLES)
@@ -97,11 +95,9 @@ def test_an_effect_has_its_own_size(error):
 
 @pytest.fixture(scope="module")
 def given():
-    frame = double_precision(lambda: build(align(*recorded("none_1", 4))))()
-    return double_precision(lambda: with_nuisances(problem(frame)))()
+    return with_nuisances(problem(build(align(*recorded("none_1", 4)))))
 
 
-@double_precision
 def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_by(given):
     healthy = fit(given, (), neutral(given))
     noise = carried(healthy.residual[:, None], redrawn(given),
@@ -113,7 +109,6 @@ def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_b
         assert square[channel == c].mean() == pytest.approx(1.0, abs=0.2)
 
 
-@double_precision
 @pytest.mark.parametrize("shown", [0.9999, 1.0001])
 def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(given, shown, monkeypatch):
     """The most visible one is hardly a candidate, or the least visible one just is."""
@@ -127,14 +122,11 @@ def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(giv
     assert len(names) == (given.sd.size if shown > 1 else 0)
 
 
-def test_where_noise_does_not_act_in_proportion_nothing_is_said():
+def test_what_is_lost_or_does_not_act_in_proportion_is_missing():
     force = np.array([[0.5], [-0.9], [3.0]])
     contact = lambda step: np.maximum(force + step, 0.0)  # noqa: E731 - noise makes the second contact, at full size
     noise = carried(contact(0.0), SIZES * 2, contact)
     np.testing.assert_allclose(np.square(noise[..., 0]).sum(0), [1.0, 0.0, 1.0], rtol=1e-6)
-
-
-def test_a_reading_lost_in_a_grip_is_missing_and_a_gap_between_two_taps_is_not():
     t = np.arange(12) / 100
     grip = np.array([0, 0, 2.0, 2.1, 0.01, 2.0, 2.0, 0, 0, 0.5, 0, 3.0])
     channels = {"fx1": grip, "fy1": 0.2 * grip, "fx2": -grip, "fy2": 0.2 * grip, "x1": t}

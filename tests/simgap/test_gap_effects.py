@@ -21,10 +21,14 @@ RIG = Rig(fingers={"1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
                    "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12))},
           fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))  # fmt: skip
 DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
+PLANTED = {"force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
+           "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
+           "force_gain": {"gain": 0.08}, "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
+           "sensor_rotation": {"angle1": 0.05, "angle2": -0.04}, "viscous_drag": {"coefficient": 0.7},
+           "fingertip_mass": {"mass": 0.012}, "contact_impact": {"impulse": 0.02}}  # fmt: skip
 
 
 def performance(n: int = 400) -> Performance:
-    """Fingers that go round slowly and press in the second half."""
     t = np.arange(n) * 5e-3
     x, y = 0.12 + 0.02 * np.sin(3 * t), 0.03 + 0.01 * np.cos(2 * t)
     position = np.stack([np.stack([x - 0.01, y], 1), np.stack([x + 0.01, y], 1)], 1)
@@ -72,13 +76,6 @@ def test_an_effect_that_is_off_changes_nothing_and_is_finite_where_a_fit_begins(
                  for p in effect.parameters.values()]  # fmt: skip
         assert all(np.isfinite(z).all() for v in (start, *steps)
                    for z in tree_leaves(effect.correct(world, v, 1.0)))  # fmt: skip
-
-
-PLANTED = {"force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
-           "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
-           "force_gain": {"gain": 0.08}, "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
-           "sensor_rotation": {"angle1": 0.05, "angle2": -0.04}, "viscous_drag": {"coefficient": 0.7},
-           "fingertip_mass": {"mass": 0.012}, "contact_impact": {"impulse": 0.02}}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(PLANTED))
@@ -136,7 +133,7 @@ def test_what_crosstalk_makes_of_noise_is_known():
     np.testing.assert_allclose(seen.std(axis=(0, 1)), 0.01, rtol=0.02)
 
 
-def test_a_drag_before_a_late_sensor_is_late_as_well():
+def test_what_is_nearest_to_the_recorded_number_is_put_in_last_and_taken_out_first():
     truth, drag, lag = performance(), catalogue()["viscous_drag"], catalogue()["force_lag"]
     late = lag.apply(drag.apply(truth, {"coefficient": 5.0}, None), {"delay": 0.1}, None)
     world = world_of(late)
@@ -145,17 +142,6 @@ def test_a_drag_before_a_late_sensor_is_late_as_well():
     off = np.abs(contact(world) - world_of(truth).force)[:, 3:-15]
     put_in = np.abs(world_of(late).force - world_of(truth).force)[:, 3:-15]
     assert off.max() < 0.1 * put_in.max()
-
-
-def test_pads_that_carry_a_block_hold_it():
-    # Friction far too low to hang a block from would let all of its heights go free.
-    world, slip = world_of(performance()), catalogue()["grip_slip"]
-    low = slip.correct(world, {"mu": 0.08}, 1.0)
-    carried = np.asarray(world.carry)
-    assert carried.sum() > 3 and (np.asarray(low.slip) * carried).sum() <= 0.2 * carried.sum()
-
-
-def test_a_bias_is_added_after_the_gain():
     truth = performance()
     gain, bias = catalogue()["force_gain"], catalogue()["force_bias"]
     values = dict.fromkeys(("fx1", "fy1", "fx2", "fy2"), 0.1)
@@ -168,6 +154,11 @@ def test_a_bias_is_added_after_the_gain():
     np.testing.assert_allclose(contact(world), world_of(truth).force, atol=1e-12)
 
 
-def test_quantised_forces_lie_on_the_lattice():
+def test_pads_that_carry_a_block_hold_it_and_quantised_forces_lie_on_the_lattice():
+    # Friction far too low to hang a block from would let all of its heights go free.
+    world, slip = world_of(performance()), catalogue()["grip_slip"]
+    low = slip.correct(world, {"mu": 0.08}, 1.0)
+    carried = np.asarray(world.carry)
+    assert carried.sum() > 3 and (np.asarray(low.slip) * carried).sum() <= 0.2 * carried.sum()
     force = catalogue()["quantisation"].finish(np.array([0.013, -0.049, 1.234]), {"step": 0.02})
     np.testing.assert_allclose(force, [0.02, -0.04, 1.24])

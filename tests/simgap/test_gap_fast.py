@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from demo_recordings import RIG, TASK
 
-from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.effects.sensing import _clock_rates
 from simgap.gap.assemble import scatters
@@ -24,27 +23,20 @@ TWICE = OperatorSettings(pace=(1.8, 2.0))
 
 
 def trials(effects, operator=None, rig=RIG):
-    """Four trials of our own simulator."""
     done = performed(TASK, rig, [BLOCKS] * 4, [31, 32, 33, 34], effects, operator)
     return [recorded(s, TASK, rig, effects) for s in done]
 
 
 @pytest.fixture(scope="module")
 def fast():
-    """The problem of healthy work twice as fast as usual, and its fit."""
     given = problem(build(align(trials({}, TWICE), TASK, RIG)))
     return given, fit(given, (), neutral(given))
 
 
-@double_precision
-def test_fast_work_shows_no_irregular_clock(fast):
+def test_fast_work_shows_no_irregular_clock_and_an_irregular_one_its_own_size(fast):
     given, healthy = fast
     (clock,) = scatters(given, healthy.residual, ["clock_jitter"])
     assert clock.value < 1.5e-3 or not clock.same
-
-
-@double_precision
-def test_an_irregular_clock_has_its_own_size_though_samples_are_grouped():
     rig = RIG.model_copy(update={"rate": 100.0})
     given = problem(build(align(trials({"clock_jitter": {"sd": 4e-3}}, rig=rig), TASK, rig)))
     assert given.frame.groups[0] > 2
@@ -52,7 +44,6 @@ def test_an_irregular_clock_has_its_own_size_though_samples_are_grouped():
     assert clock.same and clock.value == pytest.approx(4e-3, rel=0.3)
 
 
-@double_precision
 def test_a_clocks_errors_move_residuals_by_their_unit(fast):
     """Monte Carlo: speeds and positions of a smooth motion, read at wrong times."""
     given, _ = fast
@@ -97,7 +88,7 @@ def test_five_samples_give_slopes_to_fourth_order():
     assert np.abs(three[..., 0] - exact)[:, 2:-2].max() > 1e-6 * np.abs(exact).max()
 
 
-def test_a_jump_of_speed_is_in_doubt_and_noise_is_not():
+def test_a_jump_of_speed_is_in_doubt_by_as_much_as_the_rule_is_off_and_noise_is_not():
     rng, step = np.random.default_rng(0), 0.05
     sd = np.full(4000, 3e-5)
     assert (speed_jumps(sd * rng.standard_normal(4000), sd, step, 1) > 0).mean() < 0.14  # largest of three
@@ -107,9 +98,6 @@ def test_a_jump_of_speed_is_in_doubt_and_noise_is_not():
     irregular = step * np.arange(400) + 0.004 * rng.standard_normal(400)
     assert (speed_jumps(0.1 * np.sin(irregular), sd[:400], step, 1) > 0).mean() < 0.25
     assert (speed_jumps(np.full(40, np.nan), sd[:40], step, 1) == 0).all()
-
-
-def test_the_doubt_of_a_jump_is_as_large_as_the_rule_is_off():
     step, found = 0.05, []
     for when in np.linspace(0.95, 1.0, 21):
         t = step * np.arange(40)
@@ -139,19 +127,13 @@ def test_the_doubt_of_a_kink_is_as_large_as_the_rules_are_off(group):
     assert difference * doubt / step == pytest.approx(slope, rel=0.15)
 
 
-def test_noise_and_smooth_motion_have_no_kinks():
+def test_noise_smooth_motion_and_pushes_have_no_kinks_and_touches_no_speeds():
     rng, t = np.random.default_rng(0), 0.05 * np.arange(4000)
     assert (kinks(1e-3 * rng.standard_normal(4000), np.full(4000, 1e-3)) > 0).mean() < 0.25  # largest of five
     assert kinks(0.1 * np.sin(3 * t), np.full(4000, 1e-3)).max() == 0
-
-
-def test_what_fingers_push_does_not_rest():
     place = np.where(np.arange(40) < 20, 0.0, 2e-3)
     push = changes(place, np.full(40, 2e-5))
     assert push[19] == push[20] == pytest.approx(2e-3, rel=0.05) and np.count_nonzero(push) == 2
-
-
-def test_speeds_say_nothing_where_a_finger_touches():
     force = np.zeros((20, 4))
     force[8:14, 0] = 1.0
     struck = np.flatnonzero(_struck(force, np.full(20, 0.01)))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from demo_recordings import recorded
 
-from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
 from simgap.effects import catalogue
@@ -43,7 +42,7 @@ def test_level_and_colour_are_found_beside_a_loud_stretch(level, colour):
 
 @pytest.fixture(scope="module")
 def given():
-    return double_precision(lambda: problem(build(align(*recorded("none_1", 2)))))()
+    return problem(build(align(*recorded("none_1", 2))))
 
 
 def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
@@ -60,12 +59,16 @@ def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
     assert slow.any()  # three samples averaged: louder at low frequencies
 
 
-@double_precision
-def test_blocks_settle_in_the_offset_and_height_alone(given):
+def test_blocks_settle_in_the_offset_and_height_alone_and_turn_once_loads_leave_their_feet(given):
     channel, settling = np.nonzero(given.there)[2], _settling(given)
     assert len(settling) == 3 * given.frame.num_trials * given.frame.arrays.onehot.shape[2]
     for column in settling:
         assert set(channel[np.abs(column[:, 0]) > 1e-9]) <= {CHANNELS.index("offset"), CHANNELS.index("y")}
+    world, one = given.frame.world._replace(carry=np.zeros((1, 1))), np.ones((1, 1))
+    for apart, tips_over in ((1e-4, False), (3e-3, True)):
+        force = np.array([[[4.0, 0.05, -4.0, 0.05]]])
+        turn, rise, _ = turned(world, 0.4 * one, 0.02 * one, np.array([5.0, 0.0]), force, apart * one)
+        assert (turn[0, 0] > 0) == (rise[0, 0] > 0) == tips_over
 
 
 @pytest.mark.parametrize("off", [0.0, 0.004, -0.002])
@@ -87,15 +90,6 @@ def test_a_lifted_block_turns_until_its_moments_balance(given, off):
     assert ease[0, 0] == pytest.approx(compliance)
 
 
-def test_a_standing_block_turns_only_once_its_load_leaves_its_feet(given):
-    world, one = given.frame.world._replace(carry=np.zeros((1, 1))), np.ones((1, 1))
-    for apart, tips_over in ((1e-4, False), (3e-3, True)):
-        force = np.array([[[4.0, 0.05, -4.0, 0.05]]])
-        turn, rise, _ = turned(world, 0.4 * one, 0.02 * one, np.array([5.0, 0.0]), force, apart * one)
-        assert (turn[0, 0] > 0) == (rise[0, 0] > 0) == tips_over
-
-
-@double_precision
 @pytest.mark.parametrize("compliance", [0.0, 5.0, 15.0])
 def test_an_offset_is_as_noisy_as_the_moment_that_turns_its_block(given, compliance):
     """Monte Carlo: noise of heights and shears through the equation itself."""
@@ -118,7 +112,6 @@ def test_an_offset_is_as_noisy_as_the_moment_that_turns_its_block(given, complia
     assert noise == pytest.approx(np.std(apart - width * turn), rel=0.03)
 
 
-@double_precision
 def test_columns_of_late_speeds_hold_no_noise_of_the_speeds(given):
     """Fitted to it they would smooth it, and its level would come out too low."""
     world, shape = given.frame.world, given.frame.world.rates.shape
@@ -131,7 +124,6 @@ def test_columns_of_late_speeds_hold_no_noise_of_the_speeds(given):
         np.testing.assert_array_equal(before, after)
 
 
-@double_precision
 def test_a_block_that_turns_frees_all_but_where_it_stands(given):
     free = np.zeros(given.weight.shape)
     there = given.there
@@ -149,7 +141,6 @@ def test_a_block_that_turns_frees_all_but_where_it_stands(given):
     np.testing.assert_allclose(turned_variance(given, 0.04), 4 * turned_variance(given, 0.02))
 
 
-@double_precision
 def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_no_weight(given):
     a, (column,) = given.frame.arrays, _inertial(given)
     there, free = given.there, a.phase[..., Phase.FREE] > 0
@@ -179,7 +170,6 @@ def _moved(world, by):
 
 
 def test_a_block_that_a_moving_hand_takes_along_stays_there(given):
-    """A step of the hand while it holds a block on the ground is no gap where the hand is seen to move."""
     world, arrays, step = given.frame.world, given.frame.arrays, 4e-4
     x, stands = CHANNELS.index("x"), arrays.phase[0, :, Phase.PICKUP] * arrays.there[0, :, 0] > 0
     mine = np.flatnonzero(stands)[: np.flatnonzero(np.diff(np.flatnonzero(stands)) > 1)[0] + 1]

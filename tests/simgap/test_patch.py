@@ -37,7 +37,6 @@ OFFSETS = {"q11": (0.01, "rad"), "q12": (0.0, "rad"), "q21": (-0.008, "rad"), "q
 
 
 def found(effects: dict[str, dict[str, tuple[float, str]]]) -> dict:
-    """A diagnosis that names these effects with values and units."""
     several = len(effects) > 1
     parameters = {
         f"{name}.{k}" if several else k: {

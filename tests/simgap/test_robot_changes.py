@@ -56,13 +56,11 @@ def recorded(motion: str, seed: int, changed: dict[str, float]) -> Recording:
 
 def logs(seed: int, motions: tuple[str, ...] = ("slow", "fast", "step", "drop"),
          **changed: float) -> list[Recording]:  # fmt: skip
-    """One log of every motion."""
     return [recorded(m, seed + k, changed) for k, m in enumerate(motions)]
 
 
 @cache
 def healthy() -> tuple[dict, list[Recording], Calibration]:
-    """What may have changed, old logs, and what is calibrated on them."""
     old = logs(0)
     every = effects_of(SIMULATOR, old)
     effects = {n: replace(e, fitted=n in ("gain", "coulomb")) for n, e in every.items() if n in KNOWN}
@@ -71,17 +69,18 @@ def healthy() -> tuple[dict, list[Recording], Calibration]:
 
 @cache
 def compared(**changed: float) -> Changes:
-    """What is found of planted changes."""
     effects, old, calibration = healthy()
     before = compared().old if changed else None
     return changes(SIMULATOR, old, logs(100, **changed), effects, calibration=calibration, known=before)
 
 
-def test_nothing_changed_is_none():
+def test_nothing_changed_is_none_and_one_old_log_is_too_few():
     found = compared()
     body = found.body()
     assert (body["verdict"], body["causes"]) == ("none", [])
     assert sum(body["probabilities"].values()) == pytest.approx(1.0)
+    with pytest.raises(InputError, match="--healthy: has 1 log; expected two"):
+        changes(SIMULATOR, logs(0, ("slow",)), logs(1, ("slow",)), {})
 
 
 def test_a_gain_doubled_is_named_with_its_ratio():
@@ -146,7 +145,7 @@ def test_what_no_log_can_tell_apart_is_a_set():
     assert {c.effects for c in (found.best, *found.others)} == {("mass",), ("twin",)}
 
 
-def test_a_single_wild_sample_is_found_and_is_no_cause():
+def test_a_single_wild_sample_is_found_and_is_no_cause_and_the_end_of_a_log_is_not_broken():
     (log,) = logs(3, ("fast",))
     wild = log["position"].copy()
     wild[57] = -3.14
@@ -154,9 +153,6 @@ def test_a_single_wild_sample_is_found_and_is_no_cause():
     assert [(b.channel, b.time, b.value) for b in broken] == [("position", 1.14, -3.14)]
     assert np.isnan(clean["position"][57]) and np.isfinite(np.delete(clean["position"], 57)).all()
     assert without_broken(SIMULATOR, [log])[1] == []
-
-
-def test_the_end_of_a_log_is_not_broken_as_it_has_one_neighbour():
     (log,) = logs(3, ("step",))
     ends = log["duty"].copy()
     ends[[0, -1]] = 0.9
@@ -204,20 +200,12 @@ def test_an_explanations_energy_is_minus_the_log_of_its_evidence():
     assert one.energy == pytest.approx(-evidence, abs=0.1) and found.p_value < 1e-6
 
 
-def test_gains_from_motion_to_motion_are_judged_by_student():
+def test_gains_and_unlike_motions_are_judged_by_chance():
     gains = np.array([0.3, 0.1, 0.5, -0.1])
     assert by_chance(gains) == pytest.approx(ttest_1samp(gains, 0, alternative="greater").pvalue)
-
-
-def test_motions_missed_by_factors_are_called_unlike_as_often_as_stated():
     rng = np.random.default_rng(0)
     found = np.array([_unlike(np.exp(rng.normal(size=2)), np.exp(rng.normal(size=3))) for _ in range(2000)])
     assert np.mean(found < 0.1) == pytest.approx(0.1, abs=0.02)
-
-
-def test_one_old_log_is_too_few():
-    with pytest.raises(InputError, match="--healthy: has 1 log; expected two"):
-        changes(SIMULATOR, logs(0, ("slow",)), logs(1, ("slow",)), {})
 
 
 @pytest.mark.parametrize(("p", "likelier"),

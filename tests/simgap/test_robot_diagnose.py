@@ -15,8 +15,7 @@ RATE, WIDTH = 50.0, 0.03
 
 
 class Servo:
-    """A joint that follows its command but for a band: of errors that the controller does not see, or of
-    friction, which are one and the same here."""
+    """A joint that follows its command but for a band of unseen errors, or of friction."""
 
     parameters = {  # noqa: RUF012
         n: {"nominal": 0.0, "sd": 0.01, "unit": "rad", "low": 0.0, "high": 0.2} for n in ("band", "friction")
@@ -28,13 +27,11 @@ class Servo:
     window = 2.0
 
     def simulate(self, parameters, recording, start=None):
-        """Positions."""
         return {"pos": follow(parameters["band"] + parameters["friction"], recording["cmd"], start["pos"]
                               if start else 0.0)}  # fmt: skip
 
 
 def follow(width: float, command: np.ndarray, begin: float, pushed: np.ndarray | None = None) -> np.ndarray:
-    """A first-order lag towards the command outside of the band."""
     out = np.full(command.size, begin)
     for i in range(command.size - 1):
         error = command[i] - out[i]
@@ -44,7 +41,6 @@ def follow(width: float, command: np.ndarray, begin: float, pushed: np.ndarray |
 
 
 def logs(count: int = 4) -> list[Recording]:
-    """Triangles of several paces, and pushes that no candidate explains."""
     rng, t, out = np.random.default_rng(3), np.arange(0, 8, 1 / RATE), []
     for k in range(count):
         command = 0.1 * np.abs(((0.2 + 0.1 * k) * t) % 2 - 1)

@@ -46,7 +46,7 @@ def test_a_planted_value_is_found_from_wrong_starts(damped, start):
     assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
 
 
-def test_a_fit_comes_back_from_where_the_simulator_diverges():
+def test_a_fit_and_a_search_come_back_from_where_the_simulator_diverges(damped):
     class Brittle(Swing):
         def simulate(self, parameters, recording, start=None):
             out = super().simulate(parameters, recording, start)
@@ -55,28 +55,6 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
     model = composed(Brittle(), [log(0, viscous=VISCOUS)])
     found = fit(model, {"viscous": {"viscous": 0.2}})
     assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
-
-
-def test_a_large_cause_is_proposed_near_its_size():
-    """Ten times its usual size; a straight line from the usual size leads to 0.08."""
-    model = composed(Swing(), [log(s, viscous=0.1) for s in range(2)])
-    search = Search(model, tuple(model.effects), model.rows.log)
-    sets, _ = search.propose(search.nothing(), search.wanted)
-    found = point_of(model.effects, sets.fit(("viscous",), 0), ("viscous",), search.along)
-    assert found["viscous"]["viscous"] == pytest.approx(0.1, rel=0.1)
-
-
-def test_what_does_the_same_by_the_same_share_is_judged_too():
-    model = composed(Swing(), [log(s, torque_scale=1.4) for s in range(2)])
-    search = Search(model, tuple(model.effects), model.rows.log)
-    best = search.forced(("torque_scale",))
-    search._judge_twins(best, "torque_scale")
-    (twin,) = {*search.fitted} - {frozenset(), frozenset(best.names)}
-    assert twin == {"command:torque.gain"} and search.fitted[twin].score == pytest.approx(best.score, abs=2.0)
-    assert search.fitted[twin].point["command:torque.gain"]["gain"] == pytest.approx(0.4, abs=0.01)
-
-
-def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing, names = search.nothing(), tuple(damped.effects)
     best = replace(nothing, names=names, point={n: e.neutral() for n, e in damped.effects.items()})
@@ -86,6 +64,21 @@ def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(d
             nothing, names=rest, linear=replace(nothing.linear, moved={}, diverged=rest), score=-np.inf
         )
     assert search._exchange(best) is None
+
+
+def test_causes_are_proposed_near_their_size_and_twins_are_judged_too():
+    model = composed(Swing(), [log(s, viscous=0.1) for s in range(2)])
+    search = Search(model, tuple(model.effects), model.rows.log)
+    sets, _ = search.propose(search.nothing(), search.wanted)
+    found = point_of(model.effects, sets.fit(("viscous",), 0), ("viscous",), search.along)
+    assert found["viscous"]["viscous"] == pytest.approx(0.1, rel=0.1)
+    model = composed(Swing(), [log(s, torque_scale=1.4) for s in range(2)])
+    search = Search(model, tuple(model.effects), model.rows.log)
+    best = search.forced(("torque_scale",))
+    search._judge_twins(best, "torque_scale")
+    (twin,) = {*search.fitted} - {frozenset(), frozenset(best.names)}
+    assert twin == {"command:torque.gain"} and search.fitted[twin].score == pytest.approx(best.score, abs=2.0)
+    assert search.fitted[twin].point["command:torque.gain"]["gain"] == pytest.approx(0.4, abs=0.01)
 
 
 def test_a_set_is_fitted_again_from_a_larger_one_that_promises_more(damped, monkeypatch):
@@ -99,11 +92,15 @@ def test_a_set_is_fitted_again_from_a_larger_one_that_promises_more(damped, monk
     assert search._without(both, other).names == ("viscous",)
 
 
-def test_what_lines_from_starts_are_wrong_by_does_not_hide_in_a_sets_own_discrepancy(damped):
+def test_what_is_settled_stays_and_lines_from_starts_hide_in_no_discrepancy(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing = search.nothing()
     loud, quiet = (replace(nothing, discrepancy=d) for d in ({"angle": 1e3}, {}))
     assert search._begun_anew(loud, quiet)[2] > 2 * search._begun_anew(loud, loud)[2] > 0
+    first = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
+    assert first.score > nothing.score + 100
+    again = search.fit(("viscous",), first.point, [first.whiten])
+    assert abs(again.score - first.score) < BETTER
 
 
 def test_a_search_takes_fewer_windows_where_each_has_many_rows(damped, monkeypatch):
@@ -112,15 +109,6 @@ def test_a_search_takes_fewer_windows_where_each_has_many_rows(damped, monkeypat
     assert damped.thinned() == every[::2]
     none = tuple(slice(0, 0) for _ in every)  # readings that are missing throughout
     assert replace(damped, rows=replace(damped.rows, of=none)).thinned() == every
-
-
-def test_what_is_settled_stays(damped):
-    search = Search(damped, tuple(damped.effects), damped.rows.log)
-    nothing = search.nothing()
-    first = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
-    assert first.score > nothing.score + 100
-    again = search.fit(("viscous",), first.point, [first.whiten])
-    assert abs(again.score - first.score) < BETTER
 
 
 def test_rivals_are_fitted_to_the_end_before_they_are_ruled_out(damped, monkeypatch):
@@ -162,7 +150,6 @@ class Two:
     channels = {f"{n}_{side}": c for side in "ab" for n, c in Swing.channels.items()}  # noqa: RUF012
 
     def simulate(self, parameters, recording, start=None):
-        """Both angles."""
         out = {}
         for side in "ab":
             mine = {n: parameters[f"{n}_{side}"] for n in Swing.parameters}
@@ -185,8 +172,7 @@ def two(seed: int, **changed: float) -> Recording:
 
 @pytest.mark.slow
 def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
-    """By the discrepancy that is left without it, a cause seems to gain a third of what it does: what nothing
-    explains is as large as the cause's own doing. Once fitted, none is left where it acts."""
+    """By the discrepancy that is left without it, a cause seems to gain a third of what it does."""
     model = composed(Two(), [two(s, viscous_a=0.004, viscous_b=0.0005) for s in range(4)])
     search, names = Search(model, tuple(model.effects), model.rows.log), ("viscous_a", "viscous_b")
     none = search.nothing()
@@ -209,7 +195,6 @@ class Tipping:
     channels = {"angle": Channel("rad", "position")}  # noqa: RUF012
 
     def simulate(self, parameters, recording, start=None):
-        """The angle, by Runge and Kutta."""
         fall = lambda x: np.array([x[1], parameters["pull"] * np.sin(x[0])])  # noqa: E731
         x = np.array([start["angle"], start["angle_rate"]] if start else [0.01, 0.0])
         out = [x]
@@ -223,8 +208,7 @@ class Tipping:
 
 
 def test_a_start_that_says_much_of_what_follows_is_no_gap():
-    """About the start that the first samples show, a fall is far from linear; about where all put it, it is
-    not."""
+    """A fall is far from linear about the start that the first samples show alone."""
     t, logs = np.arange(0, 1, 0.01), []
     for seed in range(4):
         still = Recording("", t, {})

@@ -35,15 +35,12 @@ def whitened(model: Composed, point=None, effects=()):
     return whiten(linear.residual), {n: whiten(m.jacobian) for n, m in linear.moved.items()}, linear
 
 
-def test_windows_tile_every_log_from_where_a_start_can_be_read():
+def test_windows_tile_every_log_and_run_across_no_gap():
     model = composed([log(0), log(1, seconds=2.05)])
     for number, recording in enumerate(model.recordings):
         mine = [w for w in model.windows if w.log == number]
         assert recording.t[mine[0].begin] - recording.t[0] == pytest.approx(REACH, abs=1e-3)
         assert mine[-1].end == len(recording) and all(a.end == b.begin for a, b in itertools.pairwise(mine))
-
-
-def test_no_window_runs_across_a_gap_in_its_log():
     whole = log(0)
     kept = np.r_[0:150, 180:300, 304 : len(whole)]
     columns = {n: v[kept] for n, v in whole.columns.items()}
@@ -54,7 +51,7 @@ def test_no_window_runs_across_a_gap_in_its_log():
     assert np.mean(residual**2) < 1.3
 
 
-def test_a_start_is_right_within_what_it_says():
+def test_starts_are_right_within_what_they_say_and_of_a_jerk_read_as_such():
     t = np.linspace(0, 1, 201)
     off = []
     for seed in range(200):
@@ -63,9 +60,6 @@ def test_a_start_is_right_within_what_it_says():
         off.append([(value - 0.3 * np.sin(2.0)) / sd, (rate - 1.5 * np.cos(2.0)) / rate_sd])
     # what is said is three times what white noise makes of it
     assert np.all(np.std(off, 0) < 0.45) and np.all(np.std(off, 0) > 0.2)
-
-
-def test_the_start_of_a_jerk_is_read_as_such():
     t = np.linspace(0, 1, 101)
     values = 300.0 * np.maximum(t - 0.485, 0.0) ** 3 + 1e-4 * np.random.default_rng(0).standard_normal(t.size)
     _, (rate, sd) = smoothed(t, values, 50, 1e-4)
@@ -75,12 +69,18 @@ def test_the_start_of_a_jerk_is_read_as_such():
     assert abs(np.polyfit(x, values[47:54], 2)[1] - true) > 3 * sd
 
 
-def test_whitened_residuals_of_a_true_model_are_white():
+def test_whitened_residuals_of_a_true_model_or_of_an_effect_at_its_value_are_white():
     model = composed([log(s) for s in range(4)])
     residual, _, linear = whitened(model)
     assert 0.9 < np.sqrt(np.mean(residual**2)) < 1.05
     inside = linear.rows.window[1:] == linear.rows.window[:-1]
     assert abs(np.mean((residual[1:] * residual[:-1])[inside])) < 0.06
+    recording = log(5)
+    late = delayed(recording.t - recording.t[0], recording["angle"], 0.01)
+    model = composed([recording.with_columns({"angle": late})])
+    nominal, _, _ = whitened(model)
+    there, _, _ = whitened(model, {"readout:angle.lag": {"delay": 0.01}})
+    assert np.mean(nominal**2) > 3 and np.mean(there**2) < 1.2
 
 
 @pytest.mark.parametrize(("effect", "values"), [
@@ -135,15 +135,6 @@ def test_a_reading_s_past_is_undone_from_the_samples_that_are_there(name, value)
     assert np.isnan(undone[1::2]).all()
 
 
-def test_an_effect_at_its_value_leaves_noise_alone():
-    recording = log(5)
-    late = delayed(recording.t - recording.t[0], recording["angle"], 0.01)
-    model = composed([recording.with_columns({"angle": late})])
-    nominal, _, _ = whitened(model)
-    there, _, _ = whitened(model, {"readout:angle.lag": {"delay": 0.01}})
-    assert np.mean(nominal**2) > 3 and np.mean(there**2) < 1.2
-
-
 def test_lowpass_of_a_ramp_and_of_a_sine():
     t = np.linspace(0, 3, 3001)
     np.testing.assert_allclose(lowpass(t, 2 * t + 1, 0.1), 2 * (t - 0.1) + 1, atol=1e-12)
@@ -166,9 +157,12 @@ def test_what_only_acts_together_is_said():
     assert not identifiability([names[k] for k in kept], columns[:, kept].T @ columns[:, kept]).alike
 
 
-def test_resolution_is_found_and_only_where_there_is_one():
+def test_resolution_and_noise_are_told_only_where_there_are_any():
     values = np.random.default_rng(0).standard_normal(500)
     assert resolution(values) < 1e-4 and resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
+    log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
+    assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
+    assert estimate_noise([log.window(0, 2)], "z") == 1.0
 
 
 def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
@@ -232,14 +226,7 @@ def test_noise_of_a_step_of_the_encoder_is_estimated(noise):
     assert estimate_noise([log], "z", 1e-4) == pytest.approx(wanted, rel=0.06)
 
 
-def test_a_log_too_short_for_a_difference_tells_none():
-    log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
-    assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
-    assert estimate_noise([log.window(0, 2)], "z") == 1.0
-
-
 def still_then_swinging(seed: int, begin: float):
-    """A pendulum at rest until its motor begins."""
     found = log(seed, seconds=6.0)
     torque = np.where(found.t < begin, 0.0, found["torque"])
     empty = found.with_columns({"torque": torque})

@@ -19,12 +19,11 @@ DEGREES = Own("rad", np.pi / 180, 0.0, "deg")
 
 
 def told(mean: float | None, sd: float = 0.01) -> dict:
-    """A parameter as a history keeps it."""
     ends = None if mean is None else [mean - 1.645 * sd, mean + 1.645 * sd]
     return {"mean": mean, "sd": sd, "interval_90": ends, "unit": "N m"}
 
 
-def test_a_history_says_within_moved_and_cannot_tell_since_when_it_was_known():
+def test_a_history_says_what_moved_and_that_no_more_often_than_stated():
     old = {"a": told(1.0), "b": told(1.0), "c": told(1.0), "d": told(1.0)}
     past = [{"date": "2026-01-01", "parameters": old},
             {"date": "2026-02-01", "parameters": {"b": told(None)}}]  # fmt: skip
@@ -33,9 +32,6 @@ def test_a_history_says_within_moved_and_cannot_tell_since_when_it_was_known():
     assert {n: v["says"] for n, v in found.items()} == {"a": "within", "b": "moved", "c": "cannot tell",
                                                         "d": "cannot tell"}  # fmt: skip
     assert found["b"]["since"] == "2026-01-01" and found["b"]["then"] == 1.0
-
-
-def test_nothing_moves_more_often_than_stated():
     rng = np.random.default_rng(0)
     runs = [{n: told(float(rng.normal(1, 0.01))) for n in "abcde"} for _ in range(801)]
     pairs = zip(runs[:-1:2], runs[1::2], strict=True)
@@ -68,13 +64,10 @@ def test_what_was_named_stands_over_what_was_calibrated_and_of_a_set_nothing_is_
     assert {n: p["mean"] for n, p in found.items()} == {"joint:a.f": None, "g": 3.0, "s.v": None, "s.w": None}
 
 
-def test_a_motion_is_written_as_its_log_has_it():
+def test_motions_are_written_as_logs_have_them_and_pages_in_their_units():
     log = Recording("a.csv", np.array([2.0, 2.5]), {"u": np.array([0.0, np.pi / 2]), "v": np.ones(2)})
     text = motion_csv(log, ["u", "v"], {"u": DEGREES}, ("stamp_ms", 1e-3))
     assert text == "stamp_ms,u,v\n0,0,1\n500,90,1\n"
-
-
-def test_a_page_says_a_value_in_its_columns_unit_and_a_loads_place():
     bias = {"mean": np.pi / 180, "sd": 1e-4, "interval_90": [0.017, 0.018], "unit": "rad", "nominal": 0.0}
     setting = Setting([], own={"q1": DEGREES})
     ((_, model, found, ends),) = _parameters({"parameters": {"bias": bias}}, ["readout:q1.bias"], setting)

@@ -4,8 +4,8 @@ import sys
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from hmmseg.errors import InputError
 from simgap.robots.rows import estimate_noise
 from simgap.simulators.protocol import Job, Simulator, run_all
 from simgap.simulators.recording import Recording, read_recording
@@ -28,6 +28,15 @@ def open_loop(parameters, recording):
 open_loop.parameters, open_loop.channels = parameters, channels
 thing = Robot()
 number = 3
+"""
+RUN = """
+import sys, time
+import numpy as np
+parameters = {"slope": {"nominal": 1.0, "sd": 0.1}}
+channels = {"y": {"unit": "rad", "kind": "position", "noise": 1e-3}}
+def run(parameters, recording, start=None):
+    %s
+run.parameters, run.channels, run.timeout = parameters, channels, 0.5
 """
 
 
@@ -75,19 +84,7 @@ def test_a_run_that_diverges_is_none(file):
     ("Robot", GOOD.replace("def simulate", "def run"), "cannot be run; expected a method simulate"),
 ])  # fmt: skip
 def test_what_is_wrong_is_said_in_a_line(file, name, text, line):
-    with pytest.raises(InputError, match=line):
-        load_simulator(f"{file(text)}:{name}")
-
-
-RUN = """
-import sys, time
-import numpy as np
-parameters = {"slope": {"nominal": 1.0, "sd": 0.1}}
-channels = {"y": {"unit": "rad", "kind": "position", "noise": 1e-3}}
-def run(parameters, recording, start=None):
-    %s
-run.parameters, run.channels, run.timeout = parameters, channels, 0.5
-"""
+    refused(line, load_simulator, f"{file(text)}:{name}")
 
 
 @pytest.mark.parametrize(("code", "line"), [
@@ -110,9 +107,8 @@ run.parameters, run.channels, run.timeout = parameters, channels, 0.5
 def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, line):
     simulator = load_simulator(f"{file(RUN % code)}:run")
     log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
-    with pytest.raises(InputError, match=line) as caught:
-        run_all(simulator, [Job({"slope": 2.0}, log, None)])
-    assert "\n" not in str(caught.value) and log.t[0] == 0
+    caught = refused(line, run_all, simulator, [Job({"slope": 2.0}, log, None)])
+    assert "\n" not in caught and log.t[0] == 0
 
 
 @pytest.mark.parametrize(("name", "code", "line"), [
@@ -129,8 +125,7 @@ def test_what_else_a_simulator_offers_is_checked_alike(file, name, code, line):
     simulator = load_simulator(f"{file(text)}:run")
     log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
     given = {"simulate_many": ([Job({"slope": 2.0}, log, None)],), "state_at": (log, 0.0), "contacts": (log,)}
-    with pytest.raises(InputError, match=line):
-        getattr(simulator, name)(*given[name])
+    refused(line, getattr(simulator, name), *given[name])
 
 
 def test_an_interrupt_stays_one_and_what_is_alike_will_do(file):
@@ -143,22 +138,27 @@ def test_an_interrupt_stays_one_and_what_is_alike_will_do(file):
         assert found["y"].dtype == float and list(found) == ["y"]
 
 
-def test_a_file_called_as_a_package_does_not_stand_in_for_it(tmp_path):
+def test_a_file_is_read_by_its_own_name_whatever_it_is_called(tmp_path):
     import scipy
 
     (tmp_path / "scipy.py").write_text(GOOD)
     load_simulator(f"{tmp_path / 'scipy.py'}:Robot")
     assert sys.modules["scipy"] is scipy
+    refused(r"names no object; expected FILE\.py:NAME", load_simulator, "robot.py")
+    refused(r"no such file missing\.py", load_simulator, "missing.py:Robot")
 
 
-def test_a_missing_file_and_a_spec_without_a_name():
-    with pytest.raises(InputError, match=r"names no object; expected FILE\.py:NAME"):
-        load_simulator("robot.py")
-    with pytest.raises(InputError, match=r"no such file missing\.py"):
-        load_simulator("missing.py:Robot")
-
-
-def test_a_slower_column_has_no_more_samples_than_were_read(tmp_path):
+def test_logs_may_have_their_own_name_for_time_and_columns_at_a_slower_rate(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("stamp,y\n" + "".join(f"{0.1 * i},{i}\n" for i in range(10)))
+    log = read_recording(path, ["y"], "stamp")
+    assert log.t[3] == pytest.approx(0.3) and log["y"][3] == 3 and log.name == "log.csv"
+    for absent in ("time", "t"):  # a robot has no rig.toml
+        told = rf'column {absent}: missing; expected times in s, or time = ".+" in map.toml, one of stamp, y'
+        refused(told, read_recording, path, ["y"], absent)
+    refused(r"log\.csv: column z: missing", read_recording, path, ["z"], "stamp")
+    path.write_text("t,y\n" + "".join(f"{0.1 * (i if i != 5 else 3)},{i}\n" for i in range(10)))
+    refused(r"row 7, column t: 0\.3 after 0\.4; expected strictly increasing", read_recording, path, ["y"])
     path, rng = tmp_path / "log.csv", np.random.default_rng(0)
     fast, slow = rng.standard_normal(200), rng.standard_normal(200)
     path.write_text("t,x,y\n" + "".join(f"{0.01 * i:.2f},{fast[i]:.6f},{'' if i % 2 else f'{slow[i]:.6f}'}\n"
@@ -169,19 +169,3 @@ def test_a_slower_column_has_no_more_samples_than_were_read(tmp_path):
     ]
     assert log["y"][::2] == pytest.approx(slow[::2], abs=1e-6)
     assert estimate_noise([log], "y") == pytest.approx(1.0, rel=0.3)  # filled in between, it was nothing
-
-
-def test_logs_with_their_own_name_for_time(tmp_path):
-    path = tmp_path / "log.csv"
-    path.write_text("stamp,y\n" + "".join(f"{0.1 * i},{i}\n" for i in range(10)))
-    log = read_recording(path, ["y"], "stamp")
-    assert log.t[3] == pytest.approx(0.3) and log["y"][3] == 3 and log.name == "log.csv"
-    for absent in ("time", "t"):  # a robot has no rig.toml
-        told = rf'column {absent}: missing; expected times in s, or time = ".+" in map.toml, one of stamp, y'
-        with pytest.raises(InputError, match=told):
-            read_recording(path, ["y"], absent)
-    with pytest.raises(InputError, match=r"log\.csv: column z: missing"):
-        read_recording(path, ["z"], "stamp")
-    path.write_text("t,y\n" + "".join(f"{0.1 * (i if i != 5 else 3)},{i}\n" for i in range(10)))
-    with pytest.raises(InputError, match=r"row 7, column t: 0\.3 after 0\.4; expected strictly increasing"):
-        read_recording(path, ["y"])
