@@ -141,8 +141,7 @@ def test_trials_that_fail_and_rigid_pads_that_give_leave_out_or_allow_for_what_t
     assert design.doubts["normal"].share == pytest.approx(1.0, abs=0.2)  # in units of pads of 4000 N/m
     names = {n.name for n in design.nuisances if n.name.startswith("pad")}
     assert names >= {"pad_normal.1", "pad_normal.2", "pad_normal_exponent"}
-    mode = find_mode(posterior(design))
-    i = design.names.index(("block1", "width"))
+    mode, i = find_mode(posterior(design)), design.names.index(("block1", "width"))
     error = mode.unknowns[i] - case.blocks["block1"]["width"][0]
     assert abs(error) < 3 * np.sqrt(mode.unknowns_covariance[i, i]) < 2e-3
 
@@ -162,8 +161,7 @@ def test_unexpected_biases_and_pads_that_may_be_wrong_count_beyond_noise_and_the
 
 def test_alignments_are_combined_by_rubins_rule():
     """Within one alignment plus (1 + 1/S) times the unbiased variance between them."""
-    rng = np.random.default_rng(3)
-    draws = 7
+    rng, draws = np.random.default_rng(3), 7
     raw = 1.0 + 0.2 * rng.standard_normal((1, draws, 2, 1))
     valid = np.ones(raw.shape, bool)
     valid[0, 2, 1, 0] = False

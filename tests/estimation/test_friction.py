@@ -52,8 +52,7 @@ def planted(
     boundaries = DURATION * np.arange(1, len(steps))[None]
     t = np.arange(int(len(steps) * DURATION * RATE)) / RATE
     state = np.array([s.state != FREE for s in steps])[np.minimum((t / DURATION).astype(int), len(steps) - 1)]
-    grip = np.where(state, normal, 0.0)
-    shear = np.where(state, ratio * normal, 0.0)
+    grip, shear = np.where(state, normal, 0.0), np.where(state, ratio * normal, 0.0)
     y = 0.02 + shear / RIG.fingertip.shear_stiffness + (np.zeros(t.size) if slip is None else slip)
 
     def noisy(values: np.ndarray, sd: float = SD, offset: float = 0.0) -> np.ndarray:
@@ -109,7 +108,7 @@ def test_bias_is_removed_uncertain_gain_widens_the_bound_and_nothing_held_gives_
     trial = planted(LIFT, np.full(NUM, 0.25), rng)
     rig = RIG.model_copy(update={"systematic": Systematic(force_gain=(0.05,) * 4)})
     found = friction_posteriors([trial], LIFT, rig, SD, rng)["cup"].bound_draws
-    assert found is not None and found.std() / found.mean() == pytest.approx(np.hypot(0.05, 0.05), rel=0.15)
+    assert found.std() / found.mean() == pytest.approx(np.hypot(0.05, 0.05), rel=0.15)
     rng = np.random.default_rng(6)
     trial = planted(LIFT, np.full(NUM, 0.25), rng, normal=0.0)
     found = friction_posteriors([trial], LIFT, RIG, SD, rng)["cup"]
@@ -164,7 +163,7 @@ def test_planted_slip_tells_mu():
         trials.append(planted(LIFT, np.maximum(free, -mu), rng, slip=moved))
         others.append(planted(LIFT, free, rng))
     slipped = friction_posteriors(trials, LIFT, RIG, SD, rng)["cup"]
-    assert slipped.slip is not None and slipped.slip.seen and slipped.reason is None
+    assert slipped.slip.seen and slipped.reason is None
     low, high = slipped.to_json()["interval_95"]
     assert low < mu < high and high - low < 0.05
     assert slipped.lower_bound is not None and slipped.lower_bound <= mu
@@ -192,8 +191,7 @@ def test_sliding_tells_the_friction_of_the_support(task, close):
                        fy2=down / 2 + noise[3], vx1=sliding * 0.1, vx2=sliding * 0.1)  # fmt: skip
         known = {"cup": rng.normal(weight, 0.01, 500)} if carried.any() else {}
         ground = friction_posteriors([trial], task, RIG, SD, rng, known)["cup"].ground
-        assert ground is not None and ground.support == "ground"
-        assert ground.mu_draws.mean() == pytest.approx(mu, abs=close)
+        assert ground.support == "ground" and ground.mu_draws.mean() == pytest.approx(mu, abs=close)
         z.append((ground.mu_draws.mean() - mu) / ground.mu_draws.std())
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 2.0
 
@@ -206,7 +204,6 @@ def test_intervals_hold_however_few_samples_a_slide_has(monkeypatch):
         monkeypatch.setattr("estimation.friction._rows", lambda *_, p=push: np.stack([p, lag, down], axis=1))
         found = ground_friction([planted(SLID, np.zeros(100), rng)], SLID, subtasks(SLID), "cup", RIG, None,
                                 rng)  # fmt: skip
-        assert found is not None
         low, high = np.percentile(found.mu_draws, [2.5, 97.5])
         inside.append(low < mu < high)
     assert np.mean(inside) > 0.92

@@ -98,8 +98,7 @@ def test_samples_belong_to_one_subtask_and_means_across_a_boundary_to_none():
 
 
 def test_drawn_boundaries_follow_their_posterior_and_keep_order():
-    rng = np.random.default_rng(4)
-    times = np.linspace(0, 1, 501)
+    rng, times = np.random.default_rng(4), np.linspace(0, 1, 501)
     density = np.exp(-0.5 * ((times - 0.4) / 0.05) ** 2)
     one = BoundaryPosterior(times, density / density.sum())
     trial = TrialAlignment.__new__(TrialAlignment)

@@ -136,8 +136,7 @@ def test_creep_counts_with_all_it_crept_and_the_variance_is_that_of_noise_and_mo
     t, reading, give, _ = landed(creep=4e-4)
     found = landing(t, reading, give, place_of(t), (TOUCH, 0.0), t < TOUCH, 1e-6)
     assert found.weights @ reading == pytest.approx(-4e-4 / (give[-1] - give[0]), rel=0.01)
-    rng = np.random.default_rng(1)
-    found = []
+    rng, found = np.random.default_rng(1), []
     for k in range(300):
         t, reading, give, _ = landed(0.5, noise=2e-5, seed=k)
         one = landing(t, reading, give, place_of(t), (TOUCH + 1e-3 * rng.normal(), 1e-3), t < 0.49, 2e-5)

@@ -61,8 +61,8 @@ def starts(segmentation) -> list[float]:
     ("1", {"fx1": -0.06}, {}, 0), ("1", {"fy1": -0.06}, {}, 0), ("1", {"fx2": -0.06}, {}, 0),
     ("1", {"fy2": -0.06}, {}, 0), ("3", {"vy1": 0.04, "vy2": 0.04}, {}, 3),
     ("3", {"vy1": 0.06, "vy2": 0.06}, {}, 0), ("3", {"fy2": 0.3}, {}, 2),
-    ("2", {}, {"force_threshold": 0.5}, 0), ("1", {"fx1": 0.05, "fx2": -0.05}, {}, 1), ("1", {"fx1": 0.06}, {}, 0),
-    ("2", {}, {"force_threshold": 0.5, "velocity_threshold": 0.15}, 3),
+    ("2", {}, {"force_threshold": 0.5}, 0), ("1", {"fx1": 0.05, "fx2": -0.05}, {}, 1),
+    ("1", {"fx1": 0.06}, {}, 0), ("2", {}, {"force_threshold": 0.5, "velocity_threshold": 0.15}, 3),
 ])  # fmt: skip
 def test_rules_ask_for_every_component_beyond_its_threshold(state, change, options, expected):
     signals = replace(make_signals(state), **{name: np.array([value]) for name, value in change.items()})
@@ -133,8 +133,7 @@ def test_a_move_that_never_happens_fails_at_its_pickup_though_a_grip_flickers():
     json.dumps(out.to_json(), allow_nan=False)
     # Agreeing with the first 2 and 3 of the flicker would make the rest the moves of block2.
     out = segment("1" * 30 + "2" + "3" * 12 + "2" * 30 + "3" * 12 + "1" * 30, STACK)
-    assert out.failed is not None and out.failed.index == 5
-    assert [s.object for s in out.spans] == ["block1"] * 5
+    assert out.failed.index == 5 and [s.object for s in out.spans] == ["block1"] * 5
 
 
 def test_refused_input():
@@ -185,7 +184,6 @@ def make(task: BlockTask, rests, seed: int | None = None) -> tuple[Signals, Segm
                           (end, end)))  # fmt: skip
         if step.state == FREE:
             continue
-        assert step.move is not None
         lift = 0.03 if step.state == ABOVE_GROUND else rests[step.move][step.name == "place"]
         s.y2[inside] = s.y1[inside] = lift + 0.004
         s.x2[inside] = WIDTH[step.object]
@@ -216,8 +214,7 @@ def test_exact_signals_give_the_planted_properties(task, rests):
 
 def test_the_ends_of_a_carry_dropouts_and_missing_samples_are_left_out():
     signals, segmentation = make(STACK, RESTS["stack"])
-    carry = slice(2 * PER_SUBTASK, 3 * PER_SUBTASK)
-    third = signals.fy1.copy()
+    carry, third = slice(2 * PER_SUBTASK, 3 * PER_SUBTASK), signals.fy1.copy()
     third[carry.start + 2] += 3.6  # the first sample behind the trimmed two of forty
     properties, _ = estimate_plugin([replace(signals, fy1=third)], [segmentation], STACK)
     assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343 + 3.6 / 36)

@@ -51,15 +51,13 @@ def some_scales(num, seed=3):
 @pytest.mark.parametrize("deviations", [0, 2])
 def test_the_conditional_gaussian_is_that_of_the_joint_one(deviations):
     design, *_ = drawn(make_design(deviations=deviations), 2)
-    post = posterior(design)
-    theta = some_scales(3)
+    post, theta = posterior(design), some_scales(3)
     means, chols = post.given(theta)
     kept = slice(0, means.shape[1] - 3)  # without what slopes have alike: there are none
     for row, mean, chol in zip(theta, means[:, kept], chols[:, kept, kept], strict=True):
         every, prior, noise, data = dense(design, row, post.reference)
         gain = prior @ every.T @ np.linalg.inv(every @ prior @ every.T + np.diag(noise))
-        covariance = prior - gain @ every @ prior
-        found = np.linalg.inv(chol @ chol.T)
+        covariance, found = prior - gain @ every @ prior, np.linalg.inv(chol @ chol.T)
         scale = np.sqrt(np.diag(covariance))
         np.testing.assert_allclose(mean / scale, gain @ data / scale, atol=1e-2)
         np.testing.assert_allclose(found / np.outer(scale, scale), covariance / np.outer(scale, scale),
@@ -72,8 +70,7 @@ def test_a_channel_without_observations_keeps_its_prior():
     less = {k: getattr(design, k)[kept]
             for k in ("mean", "variance", "shifts", "channel", "unit", "trial", "move", "slope")}  # fmt: skip
     cut = replace(design, unknowns=design.unknowns[:2], coefficients=design.coefficients[kept][:, :2], **less)
-    post = posterior(cut)
-    theta = np.zeros((3, 6))
+    post, theta = posterior(cut), np.zeros((3, 6))
     theta[:, 5] = (0.0, 1.0, -2.0)
     found = post.log_prob(theta)
     np.testing.assert_allclose(found - found[0], -0.5 * theta[:, 5] ** 2, atol=1e-9)
@@ -98,8 +95,7 @@ def test_prior_of_a_sum_against_drawn_sums(terms):
 
 def with_slopes(design, seed=11):
     """The design with a slope beside each mean of widths and heights, and what it stands for."""
-    means = np.flatnonzero(design.channel > 0)
-    rng = np.random.default_rng(seed)
+    means, rng = np.flatnonzero(design.channel > 0), np.random.default_rng(seed)
     more = {"mean": 0.2 * rng.normal(size=means.size), "variance": np.full(means.size, 0.1**2),
             "coefficients": np.zeros((means.size, len(design.unknowns))),
             "shifts": 0.1 * rng.normal(size=(means.size, len(design.nuisances))),
@@ -114,8 +110,7 @@ def test_log_prob_is_the_density_of_all_observations(deviations, slopes, close):
     """Up to one constant, against one dense Gaussian; each grip's own share enters its mean and its slope."""
     plain, *_ = drawn(make_design(deviations=deviations), 1)
     design, means = with_slopes(plain) if slopes else (plain, np.zeros(0, int))
-    post = posterior(design)
-    theta = some_scales(8 if slopes else 12)
+    post, theta = posterior(design), some_scales(8 if slopes else 12)
     num, expected = design.mean.size, []
     for row in theta:
         share = priors.SCATTER_MEDIAN * np.exp(row[3:])
@@ -231,8 +226,7 @@ def test_scales_and_unknowns_have_the_moments_of_importance_sampling(post, mode,
     x, weight = importance(post, mode, 5, 20_000)
     assert 1 / (weight**2).sum() > 0.6 * len(x)  # the proposal is close, so its weights are even
     mean = weight @ x
-    sd = np.sqrt(weight @ (x - mean) ** 2)
-    flat = draws.scales.reshape(-1, 6)
+    sd, flat = np.sqrt(weight @ (x - mean) ** 2), draws.scales.reshape(-1, 6)
     assert draws.converged and draws.ess >= MIN_ESS
     assert np.abs((flat.mean(axis=0) - mean) / sd * np.sqrt(draws.ess)).max() < 5
     for i, order in enumerate(np.argsort(x, axis=0).T):  # tails are too heavy to compare deviations
@@ -243,8 +237,7 @@ def test_scales_and_unknowns_have_the_moments_of_importance_sampling(post, mode,
     means, chols = post.given(x)
     num = len(post.design.unknowns)
     inverse = np.linalg.inv(chols)[:, :, :num]
-    variances = (inverse**2).sum(axis=1)
-    mean = weight @ means[:, :num]
+    variances, mean = (inverse**2).sum(axis=1), weight @ means[:, :num]
     sd = np.sqrt(weight @ (variances + (means[:, :num] - mean) ** 2))
     np.testing.assert_allclose((draws.flat.mean(axis=0) - post.reference - mean) / sd, 0.0, atol=0.1)
     np.testing.assert_allclose(draws.flat.std(axis=0), sd, rtol=0.08)

@@ -157,8 +157,7 @@ def test_an_off_centre_mass_makes_shears_unequal_and_stiff_pads_do_not_chatter()
     a = perform(plan(TASK, BLOCKS, tips_round, Style(), rng()), BLOCKS, tips_round)
     b = perform(plan(TASK, BLOCKS, moved, Style(), rng()), BLOCKS, moved)
     leave, meet = a.boundaries[1:3]
-    air = (a.t > leave + 0.2) & (a.t < meet - 0.1)
-    n = min(len(a.t), len(b.t))
+    air, n = (a.t > leave + 0.2) & (a.t < meet - 0.1), min(len(a.t), len(b.t))
     more = (b.force[:n] - a.force[:n])[air[:n]].mean(0)
     couple = 0.5 * 0.003 / 0.017
     # The heavier side sinks and the grip then pushes askew; pads that resist turning take some of it.
@@ -214,8 +213,7 @@ def test_a_finger_may_close_first_and_the_truth_is_of_the_grip():
 
 def test_a_seal_is_kept_and_a_changed_label_is_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sets, "TRIALS", 1)
-    found = generate(2, 7, tmp_path)
-    again = generate(2, 7, tmp_path / "again")
+    found, again = generate(2, 7, tmp_path), generate(2, 7, tmp_path / "again")
     assert found != again  # salted anew
     a, b = unseal(tmp_path), unseal(tmp_path / "again")
     assert a == b

@@ -138,7 +138,7 @@ def test_changed_code_is_told(tmp_path):
     git("add", ".")
     git("commit", "-m", "first")
     clean = commit_of(tmp_path)
-    assert clean is not None and not clean.endswith("+")
+    assert not clean.endswith("+")
     (tmp_path / "result.json").write_text("{}\n")
     assert commit_of(tmp_path) == clean
     (tmp_path / "code.py").write_text("a = 2\n")

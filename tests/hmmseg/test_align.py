@@ -26,8 +26,7 @@ NEAR = 0.05  # s
 
 def residuals(trials, truth, task, rig):
     """Boundary residuals [s] (num_trials, num_boundaries), spans checked for sense."""
-    found = segment(trials, task, rig)
-    out = []
+    found, out = segment(trials, task, rig), []
     for segmentation, trial, times in zip(found, trials, truth, strict=True):
         assert segmentation.complete
         spans = segmentation.spans
@@ -176,7 +175,7 @@ def names(segmentation) -> list[str]:
 def test_misfits_are_found_at_the_subtask_that_fails(edit, which):
     trial, expected = EDITS[edit](TRIALS[which], TRUTH[which])
     (found,) = segmented(trial)
-    assert found.failed is not None and found.failed.index == expected
+    assert found.failed.index == expected
     document = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert document["complete"] is False
     assert (REASONS.get(edit, "") if which == 0 else "") in document["failed"]["reason"]
@@ -223,10 +222,10 @@ def test_the_others_tell_which_block_is_which_and_a_longer_recording_fails_after
     b = TRUTH[0]
     twice = join(TRIALS[0], (-np.inf, b[3] + 0.5), (b[0] - 0.5, b[3] + 0.8))
     (*_, found) = segmented(TRIALS[1], TRIALS[2], TRIALS[1], twice)
-    assert found.failed is not None and (found.failed.index, found.failed.object) == (5, "block2")
+    assert (found.failed.index, found.failed.object) == (5, "block2")
     assert "block1 was gripped again" in found.failed.reason
     (found,) = segmented(TRIALS[0], task=ONE_BLOCK)
-    assert found.failed is not None and found.failed.index == 4
+    assert found.failed.index == 4
     assert names(found) == [f"{n} block1" for n in ("pregrasp", "pickup", "carry", "place", "release")]
 
 

@@ -49,8 +49,7 @@ def linear(root, speed, kind, sd=1e-7):
     if kind == "impact":  # stops dead after the touch, up to the pad's compression
         return Crossing(left, 0.15 * speed * (WIDTH - root), speed, 0.0, sd, sd, 1e-5, kind)
     if kind == "launch":  # from rest under load, constant jerk: a third of the speed on the mean
-        after = WIDTH - root
-        creep = 1e-3 * speed
+        after, creep = WIDTH - root, 1e-3 * speed
         return Crossing(-creep * root, (creep + (speed - creep) / 3) * after, 0.75 * creep, speed, sd, sd,
                         1e-5, kind)  # fmt: skip
     return Crossing(left, speed * (WIDTH - root), speed, speed, sd, sd, 1e-5)
@@ -153,8 +152,7 @@ def touches(rng, width, num=1):
         left = -distance * (_minimum_jerk(at_hit) - _minimum_jerk(phase))
         v_left = (1 + SHAPE * rng.normal()) * distance * _minimum_jerk_slope(phase) / duration
         stop, after = np.exp(rng.uniform(*np.log(STOP))), width - root
-        right = v * stop * -np.expm1(-after / stop)
-        noise = rng.normal(size=4)
+        right, noise = v * stop * -np.expm1(-after / stop), rng.normal(size=4)
         roots.append(root)
         # A sample interval before; drawn apart, so that what stands above is as it was.
         phase_then, other = (phase - width / duration,

@@ -70,7 +70,6 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(where, tmp_path, monke
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / where) if where == "a file" else where)
     monkeypatch.setenv("HOME", "/proc/nowhere")
     folder = cache_folder()
-    assert folder is not None
     keep(folder / "one.json", b"1")
     assert kept(folder / "one.json") is None and os.listdir(tmp_path) == ["a file"]
 

@@ -125,15 +125,13 @@ def score(f: Features, state: str) -> np.ndarray:
 def test_ungripped_force_density_integrates_to_one():
     # Importance sampling with a proposal of the same three parts, heavier at the edges.
     rng, num, scale, span = np.random.default_rng(0), 400_000, 0.1, 6.0
-    part = rng.integers(3, size=num)
-    silent = stats.t(3, scale=0.15)
+    part, silent = rng.integers(3, size=num), stats.t(3, scale=0.15)
     x = silent.rvs(size=(num, 4), random_state=rng)
     wide = np.stack([rng.uniform(-1, 7, num), rng.uniform(-7, 7, num)], axis=1)
     x[part == 1, :2] = wide[part == 1]
     mirrored = wide * np.array([-1.0, 1.0])
     x[part == 2, 2:] = mirrored[part == 2]
-    quiet = silent.logpdf(x)
-    box = -np.log(8.0 * 14.0)
+    quiet, box = silent.logpdf(x), -np.log(8.0 * 14.0)
     one = np.where((x[:, 0] > -1) & (x[:, 0] < 7) & (np.abs(x[:, 1]) < 7), box, -np.inf)
     two = np.where((x[:, 2] < 1) & (x[:, 2] > -7) & (np.abs(x[:, 3]) < 7), box, -np.inf)
     proposal = np.logaddexp.reduce([quiet.sum(axis=1), one + quiet[:, 2:].sum(axis=1),
@@ -222,8 +220,7 @@ def test_otsu_against_trying_every_split():
 
 def test_location_and_scale_maximise_the_weighted_student_likelihood():
     rng = np.random.default_rng(1)
-    values = 3.0 + 0.2 * rng.standard_t(3, size=400)
-    weights = rng.uniform(size=400)
+    values, weights = 3.0 + 0.2 * rng.standard_t(3, size=400), rng.uniform(size=400)
 
     def loss(p):
         return -weights @ stats.t.logpdf(values, TAIL, loc=p[0], scale=np.exp(p[1]))

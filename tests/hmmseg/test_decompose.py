@@ -120,8 +120,7 @@ def block_tasks(draw):
     initial, moves = dict(support), []
     for _ in range(draw(st.integers(1, 6))):
         free = [name for name in names if name not in support.values()]
-        name = draw(st.sampled_from(free))
-        slide = draw(st.booleans())
+        name, slide = draw(st.sampled_from(free)), draw(st.booleans())
         to = support[name] if slide else draw(st.sampled_from([GROUND, *(f for f in free if f != name)]))
         moves.append((name, to, slide))
         support[name] = to
@@ -135,7 +134,7 @@ def built(arguments) -> BlockTask:
 
 @settings(max_examples=60, deadline=None)
 @given(block_tasks())
-def test_heights_agree_with_stacking_and_with_rank(arguments):
+def test_heights_agree_with_stacking_and_rank_and_every_property_has_evidence_or_a_reason(arguments):
     task = built(arguments)
     heights = dict(zip(task.objects, np.sqrt([2.0, 3.0, 5.0, 7.0]), strict=False))
     support = dict(task.initial)
@@ -154,13 +153,6 @@ def test_heights_agree_with_stacking_and_with_rank(arguments):
     free = np.abs(null_space(matrix)).max(axis=1, initial=0.0) > 1e-9
     found = decompose(task)
     assert [found.properties[name]["height"].kind == "value" for name in task.objects] == list(~free)
-
-
-@settings(max_examples=60, deadline=None)
-@given(block_tasks())
-def test_every_property_has_evidence_or_a_reason(arguments):
-    task = built(arguments)
-    found = decompose(task)
     lifted = {move.object for move in task.moves if not move.slide}
     touched = {move.object for move in task.moves}
     for name, entries in found.properties.items():

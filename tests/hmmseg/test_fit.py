@@ -39,8 +39,7 @@ def record(seed, sequence=("wait", "push", "turn", "pull"), rate=50.0, correlati
     """A trial of noisy levels and its boundaries; what the channels show comes `lag` s after them."""
     rng = np.random.default_rng(seed)
     durations = mean * rng.uniform(0.6, 1.4, len(sequence))
-    boundaries = np.cumsum(durations)[:-1]
-    t = np.arange(0, durations.sum(), 1 / rate)
+    boundaries, t = np.cumsum(durations)[:-1], np.arange(0, durations.sum(), 1 / rate)
     path = np.searchsorted(boundaries + lag, t, side="right")
     noise = rng.standard_t(4, (t.size, 2)) * 0.3
     for i in range(1, t.size):
@@ -78,8 +77,7 @@ def test_planted_boundaries_are_recovered_without_labels():
 
 def test_labels_teach_their_lag_and_correlated_noise_widens_intervals():
     # The channels change 0.2 s after the labels: only a labelled model can know.
-    data = recordings(3, start=40, lag=0.2)
-    lagged = taught(lag=0.2)
+    data, lagged = recordings(3, start=40, lag=0.2), taught(lag=0.2)
     for result, (_, boundaries) in zip(segment_sequence([t for t, _ in data], TASK, lagged), data,
                                        strict=True):  # fmt: skip
         np.testing.assert_allclose(found(result), boundaries, atol=0.06)
@@ -319,8 +317,7 @@ def test_naming_is_the_sum_over_all_choices(labelled):
 
 
 def test_a_partition_needs_a_cell_a_stretch_and_a_level_cut_in_two_is_not_seen():
-    rng = np.random.default_rng(5)
-    level = np.repeat([0.0, 0.0, 1.5], 60)
+    rng, level = np.random.default_rng(5), np.repeat([0.0, 0.0, 1.5], 60)
     values = [level[:, None] + 0.3 * rng.normal(size=(180, 2)) for _ in range(3)]
     found = np.exp(seen(values, [np.repeat([0, 1, 2], 60)] * 3, 3, share=2.0))
     assert found[0] < 0.01 and found[1] > 0.999
@@ -386,8 +383,7 @@ def test_boundaries_and_gain_from_the_joint_table_of_naming_and_label():
 
 
 def test_places_lie_near_a_time_and_intervals_of_nine_tenths_are_the_shortest():
-    edges = np.arange(102.0)
-    crossing = np.zeros(100)
+    edges, crossing = np.arange(102.0), np.zeros(100)
     crossing[[20, 21, 50, 51, 80]] = [0.3, 0.2, 0.23, 0.23, 0.04]
     found = places(edges, crossing, 51.2)
     assert [(p.time, pytest.approx(p.probability)) for p in found] == [(21.0, 0.5), (51.2, 0.46)]
@@ -419,7 +415,7 @@ def test_what_cannot_be_known_is_told_with_the_label_that_would_decide():
             if span.alternatives:
                 assert 0.5 < sum(place.probability for place in span.alternatives) <= 1 + 1e-9
     question = most_telling(found)
-    assert question is not None and question.gain > 0.1
+    assert question.gain > 0.1
     assert question.gain == max(s.question.gain for s in found if s.question is not None)
     entry = found[0].to_json()
     assert any(segment.get("alternatives") for segment in entry["segments"])
@@ -495,11 +491,9 @@ def test_cells_average_fresh_readings_and_stay_empty_where_there_are_none():
 
 
 def test_features_do_not_depend_on_units_and_no_slope_looks_across_a_jump():
-    rng = np.random.default_rng(0)
-    t = np.arange(200) / 20
+    rng, t = np.random.default_rng(0), np.arange(200) / 20
     x = rng.normal(size=200).cumsum()
-    one = Trial("x", t, {"a": x})
-    other = Trial("x", t, {"a": 1000 * x - 7})
+    one, other = Trial("x", t, {"a": x}), Trial("x", t, {"a": 1000 * x - 7})
     values = [features(trial, feature_map([trial], ("a",))).values for trial in (one, other)]
     np.testing.assert_allclose(values[0], values[1], atol=1e-9)
     x = np.concatenate([0.5 * np.arange(60), 40 - 0.2 * np.arange(60)])[:, None]

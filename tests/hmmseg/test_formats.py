@@ -191,7 +191,7 @@ def test_robomimic_demonstrations(tmp_path):
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_lerobot_episodes(tmp_path, version):
+def test_lerobot_episodes_are_read_and_written_back_with_subtasks(tmp_path, version):
     folder = write_lerobot(tmp_path / "set", version)
     assert parts_of(folder) == ["0", "1", "2"]
     rig = parse_rig({"columns": {"t": "timestamp", "x": "observation.state.right_x"}})
@@ -199,6 +199,31 @@ def test_lerobot_episodes(tmp_path, version):
     np.testing.assert_allclose(trial.t, np.arange(60) / 50, atol=1e-6)
     np.testing.assert_array_equal(trial.channels["x"], np.arange(60) * 2 + 3)
     np.testing.assert_array_equal(trial.channels["action.b"], 1.0)
+    rig = parse_rig({"columns": {"t": "timestamp"}})
+    trial = read_trial(f"{folder}#1", rig, SequenceTask(("a",), channels=("action.b",)))
+    for place, write in lerobot_files(folder, {1: (trial, SPANS)}).items():
+        (tmp_path / "new" / place).parent.mkdir(parents=True, exist_ok=True)
+        write(tmp_path / "new" / place)
+    info = json.loads((tmp_path / "new/meta/info.json").read_text())
+    language = {"dtype": "language", "shape": [1], "names": None}
+    assert [info["features"][name] for name in ("language_persistent", "language_events")] == [language] * 2
+    files = sorted((tmp_path / "new/data").rglob("*.parquet"))
+    rows = [row for file in files for row in pq.read_table(file).to_pylist()]
+    assert not any(row["language_persistent"] for row in rows if row["episode_index"] != 1)
+    one = [row for row in rows if row["episode_index"] == 1]
+    said = {"role": "assistant", "style": "subtask", "camera": None, "tool_calls": None}
+    assert all(row["language_events"] == [] for row in rows)
+    for row in one:  # every sample repeats what is said of its episode
+        assert row["language_persistent"] == [
+            said | {"content": s.subtask, "timestamp": pytest.approx(s.start)} for s in SPANS
+        ]
+    held = read_table(f"{tmp_path}/new#1").columns["language.subtask"].tolist()
+    expected = ["reach" if t < 0.25 else "push" if t < 0.4 else "leave"
+                for t in [row["timestamp"] for row in one]]  # fmt: skip
+    assert held == expected
+    again = read_trial(f"{tmp_path}/new#1", rig, SequenceTask(("a",), channels=("action.b",)))
+    np.testing.assert_array_equal(again.channels["action.b"], 1.0)
+    refused("has subtasks already; expected no labels yet", lerobot_files, tmp_path / "new", {})
 
 
 def test_wide_columns_and_parts_are_told_by_their_names(tmp_path):
@@ -287,36 +312,6 @@ def test_a_topic_of_a_new_mcap(tmp_path):
     assert added[1][1]["end_sd"] == 0.03
     again = read_trial(tmp_path / "b.mcap", rig, SequenceTask(("a",), channels=("f",)))
     np.testing.assert_array_equal(again.channels["f"], trial.channels["f"])
-
-
-@pytest.mark.parametrize("version", [2, 3])
-def test_a_lerobot_data_set_with_subtasks(tmp_path, version):
-    folder = write_lerobot(tmp_path / "set", version)
-    rig = parse_rig({"columns": {"t": "timestamp"}})
-    trial = read_trial(f"{folder}#1", rig, SequenceTask(("a",), channels=("action.b",)))
-    for place, write in lerobot_files(folder, {1: (trial, SPANS)}).items():
-        (tmp_path / "new" / place).parent.mkdir(parents=True, exist_ok=True)
-        write(tmp_path / "new" / place)
-    info = json.loads((tmp_path / "new/meta/info.json").read_text())
-    language = {"dtype": "language", "shape": [1], "names": None}
-    assert [info["features"][name] for name in ("language_persistent", "language_events")] == [language] * 2
-    files = sorted((tmp_path / "new/data").rglob("*.parquet"))
-    rows = [row for file in files for row in pq.read_table(file).to_pylist()]
-    assert not any(row["language_persistent"] for row in rows if row["episode_index"] != 1)
-    one = [row for row in rows if row["episode_index"] == 1]
-    said = {"role": "assistant", "style": "subtask", "camera": None, "tool_calls": None}
-    assert all(row["language_events"] == [] for row in rows)
-    for row in one:  # every sample repeats what is said of its episode
-        assert row["language_persistent"] == [
-            said | {"content": s.subtask, "timestamp": pytest.approx(s.start)} for s in SPANS
-        ]
-    held = read_table(f"{tmp_path}/new#1").columns["language.subtask"].tolist()
-    expected = ["reach" if t < 0.25 else "push" if t < 0.4 else "leave"
-                for t in [row["timestamp"] for row in one]]  # fmt: skip
-    assert held == expected
-    again = read_trial(f"{tmp_path}/new#1", rig, SequenceTask(("a",), channels=("action.b",)))
-    np.testing.assert_array_equal(again.channels["action.b"], 1.0)
-    refused("has subtasks already; expected no labels yet", lerobot_files, tmp_path / "new", {})
 
 
 @pytest.mark.parametrize(("write", "trials", "line"), [

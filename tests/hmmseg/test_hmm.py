@@ -41,8 +41,7 @@ def test_every_quantity_matches_enumeration(size, single):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
     for found in (hmm.log_evidence(ll, chain), hmm.filter(ll, chain).log_evidence):
         np.testing.assert_allclose(found, log_evidence, rtol=1e-12)
-    ranked = hmm.k_best(ll, chain, 7)
-    order = np.argsort(-weights)[:7]
+    ranked, order = hmm.k_best(ll, chain, 7), np.argsort(-weights)[:7]
     np.testing.assert_allclose(ranked.log_prob, weights[order], rtol=1e-12)
     assert [a.path.tolist() for a in ranked] == paths[order].tolist()
 
@@ -366,8 +365,7 @@ def test_every_step_matches_enumeration(lag, num_skips):
     chain = hmm.Chain(rows[0], rows[1], rows[2:] or None)
     stream = hmm.StreamingFilter(chain, lag)
     for t, row in enumerate(ll):
-        step = stream.update(row)
-        bands = [np.tile(r, (t, 1)) for r in rows]
+        step, bands = stream.update(row), [np.tile(r, (t, 1)) for r in rows]
         *_, log_evidence, smoothed, moves = brute(ll[: t + 1], bands, final=np.zeros(3))
         assert step.sample == t
         np.testing.assert_allclose(step.log_evidence, log_evidence)
@@ -400,8 +398,7 @@ def test_a_long_stream_equals_the_recording(num_states, optional):
     presence = [0.9 if optional and k == 2 else 1.0 for k in range(num_states)]
     chain = hmm.left_to_right([n / num_states] * num_states, presence)
     stream = hmm.StreamingFilter(chain, lag)
-    steps = [stream.update(row) for row in ll]
-    offline = hmm.filter(ll, chain)
+    steps, offline = [stream.update(row) for row in ll], hmm.filter(ll, chain)
     np.testing.assert_allclose([s.filtered for s in steps], offline.filtered, atol=1e-9)
     np.testing.assert_allclose(stream.finish().smoothed, hmm.smooth(ll, chain).smoothed[-lag:], atol=1e-9)
     # Whoever waits long enough agrees with the whole recording where it is not near its end.
@@ -559,8 +556,7 @@ def test_tables_of_lasting_have_their_moments_and_decide_where_samples_do_not():
     interval = hmm.smooth(np.zeros((40, 2)), chain).start_intervals(0.9)[0]
     np.testing.assert_allclose(interval, [30 - 2.3, 30 + 2.3], atol=1.0)  # sd 2 / sqrt(2)
     chain = hmm.lasting([50.0, 200.0], [10.0, 5.0])
-    n = np.arange(1, chain.pmf.shape[1] + 1)
-    p = np.exp(chain.pmf)
+    n, p = np.arange(1, chain.pmf.shape[1] + 1), np.exp(chain.pmf)
     np.testing.assert_allclose(p.sum(axis=1), 1.0)
     np.testing.assert_allclose(p @ n, [50.0, 200.0], rtol=1e-3)
     np.testing.assert_allclose(np.sqrt(p @ n**2 - (p @ n) ** 2), [10.0, 5.0], rtol=1e-2)

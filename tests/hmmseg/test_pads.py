@@ -27,8 +27,7 @@ PRIOR = (2.5e-4, 0.75e-4)
 
 
 def squeeze(step=0.02, compliance=2.5e-4):
-    rng = np.random.default_rng(0)
-    fine = np.arange(0, 0.8, 1e-4)
+    rng, fine = np.random.default_rng(0), np.arange(0, 0.8, 1e-4)
     force = 4 * np.clip(fine / 0.15, 0, 1) ** 1.5 + 0.3 * np.sin(9 * fine) * (fine > 0.15)
     t = np.arange(0.02, 0.78, step)
     load = np.interp(t, fine, force) + 0.012 * rng.standard_normal(t.size)
@@ -102,8 +101,7 @@ def test_healthy_forces_are_neither_late_nor_filtered():
 
 def test_reading_again_undoes_what_was_found():
     t = np.arange(0, 1, 0.01)
-    ramp = np.clip(t - 0.3, 0, 0.4)
-    zero = np.zeros(t.size)
+    ramp, zero = np.clip(t - 0.3, 0, 0.4), np.zeros(t.size)
     late = np.interp(t - 0.05, t, ramp)
     known = dict.fromkeys(("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2"),
                           late)  # fmt: skip
@@ -142,8 +140,7 @@ COMPLIANCE, WIDTH = 2.5e-4, 0.03
 
 
 def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE):
-    rng = np.random.default_rng(seed)
-    fine = np.arange(0, 2.0, 1e-4)
+    rng, fine = np.random.default_rng(seed), np.arange(0, 2.0, 1e-4)
     start = rng.uniform(0.3, 0.32)
     closed = np.clip((fine - start) / 0.25, 0, 1) - np.clip((fine - start - 0.9) / 0.25, 0, 1)
     way = closed**2 * (3 - 2 * closed)
@@ -210,8 +207,7 @@ def test_noise_that_joining_and_filters_average_tells_of_no_delay(step, noise, s
 def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
     fine = np.arange(0, 1.0, 1e-4)
     force = 4 * np.clip((fine - 0.31) / 0.2, 0, 1)
-    kept = np.exp(-1e-4 / 0.03)
-    t = np.arange(0, 0.98, 0.02)
+    kept, t = np.exp(-1e-4 / 0.03), np.arange(0, 0.98, 0.02)
     filtered = np.interp(t, fine, lfilter([1 - kept], [1, -kept], force))
     undone, louder = _unfiltered(t, filtered, 0.03)
     np.testing.assert_allclose(undone, np.interp(t, fine, force), atol=0.15)
@@ -237,8 +233,7 @@ SD = 2e-5
 
 
 def releases(toe=NONE, number=8, compliances=(1e-4,), seed=0):
-    rng = np.random.default_rng(seed)
-    out = []
+    rng, out = np.random.default_rng(seed), []
     for k in range(number):
         load = np.r_[np.full(8, 10.0), np.linspace(10, rng.uniform(0.1, 0.6), 9)]
         give = compliances[k % len(compliances)] * load + toe.give(load)
@@ -248,8 +243,7 @@ def releases(toe=NONE, number=8, compliances=(1e-4,), seed=0):
 
 @pytest.mark.parametrize("planted", [Toe(6e-4, 0.8), Toe(3e-4, 1.6)])
 def test_a_planted_toe_is_found(planted):
-    found = find_toe(releases(planted))
-    at = np.array([0.0, 0.2, 1.0, 4.0])
+    found, at = find_toe(releases(planted)), np.array([0.0, 0.2, 1.0, 4.0])
     np.testing.assert_allclose(found.give(at), planted.give(at), atol=6e-5)
     assert found.slope == pytest.approx(planted.slope, rel=0.3)
 

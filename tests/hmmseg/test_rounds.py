@@ -123,8 +123,7 @@ def test_hundreds_of_rounds_cost_no_more_each():
     seconds = {}
     for number in (40, 40, 320):  # the first compiles
         session, _ = pieces((0,), number)
-        began = time.process_time()
-        aligned = align([session], PICK, RIG)
+        began, aligned = time.process_time(), align([session], PICK, RIG)
         seconds[number] = (time.process_time() - began) / number
         assert aligned.trials[0].segmentation.repetitions == number
         assert aligned.trials[0].segmentation.complete

@@ -168,8 +168,7 @@ def _trial() -> tuple[Trial, Rig]:
 def _with_differences(trial: Trial, over: int) -> Trial:
     channels = dict(trial.channels)
     for name in ("q11", "q12", "q21", "q22"):
-        q = channels[name]
-        first = np.zeros(over)
+        q, first = channels[name], np.zeros(over)
         channels[f"d{name}"] = np.concatenate(
             [first, (q[over:] - q[:-over]) / (trial.t[over:] - trial.t[:-over])]
         )

@@ -279,8 +279,7 @@ LAYOUTS = {"commas": written(), "semicolons": written(";"),
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_layouts_hold_the_same_numbers(tmp_path, layout):
-    path = tmp_path / "a.csv"
-    text = LAYOUTS[layout]
+    path, text = tmp_path / "a.csv", LAYOUTS[layout]
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     trial = read_trial(path, task=TWO)
     for found, planted in ((trial.t, T), (trial.channels["x"], X), (trial.channels["f"], F)):

@@ -39,8 +39,7 @@ SETUP = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))  # untared
 
 
 def read(file=CASE / "trial_01.csv", rig=RIG):
-    trial = Trial.read(file, rig)
-    watcher = Watcher(file.parent / "task.toml", rig)
+    trial, watcher = Trial.read(file, rig), Watcher(file.parent / "task.toml", rig)
     table = np.stack([trial.channels[name] for name in watcher.channels], axis=1)
     return watcher, trial.t, table
 
@@ -62,8 +61,7 @@ def test_emissions_are_those_off_line():
     f = features(task_space(trial, rig), rig)
     scale = {"force": 0.012, "carry": 0.02, "net_x": 0.05, "shear": 0.08, "velocity": 0.003, "level": 1e-4,
              "width": 1e-4}  # fmt: skip
-    steps = subtasks(task)
-    bias = np.array([0.01, -0.02, 0.005, 0.0])
+    steps, bias = subtasks(task), np.array([0.01, -0.02, 0.005, 0.0])
     p = Parameters(bias, {"block1": 0.34, "block2": 0.44}, scale, {"block1": 0.016, "block2": 0.0254},
                    ({1: 0.05},))  # fmt: skip
     expected, halting = log_likelihoods(f, steps, p, 0, rung=0.0), _log_halting(f, p)
@@ -266,8 +264,7 @@ def performed():
 
 
 def follow_wrist(columns, rig, task=RESTACK, stop=None):
-    watcher = Watcher(task, rig)
-    lines = []
+    watcher, lines = Watcher(task, rig), []
     for k, t in enumerate(columns["t"][:stop]):
         lines.append(json.loads(watcher.update(float(t), {n: columns[n][k]
                                                           for n in watcher.channels}).line()))  # fmt: skip
@@ -371,8 +368,7 @@ def test_a_grip_lasts_until_its_pads_let_go(give):
     """However far they have yielded: a gripper has turned long before."""
     t = np.arange(0, 3, 0.01)
     way = np.maximum(0.036 - 0.1 * np.clip(t - 0.5, 0, None), 0.03 - give)
-    opening = way + 0.1 * np.clip(t - 2, 0, None)
-    closings = Opening(3000.0)
+    opening, closings = way + 0.1 * np.clip(t - 2, 0, None), Opening(3000.0)
     for at, value in zip(t, opening, strict=True):
         closings.follow(float(at), float(value))
     (grip,) = closings.grips
@@ -384,8 +380,7 @@ def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
     """As when a block drops out of the grip in mid-air; what is smoothed errs alike, but not so much."""
     folder = shared / "panda" / "wrist_restack_1"
     raw = trial_of(read_table(folder / "wrist_01.csv", None), ARM_RIG, None)
-    columns = {"t": raw.t} | raw.channels
-    gone = (raw.t > 4.36) & (raw.t < 5.78)
+    columns, gone = {"t": raw.t} | raw.channels, (raw.t > 4.36) & (raw.t < 5.78)
     columns["Fz"] = columns["Fz"] + 0.466 * gone
     _, lines, final = follow_wrist(columns, ARM_RIG, read_task(folder / "task.toml"))
     assert not final["fits"]

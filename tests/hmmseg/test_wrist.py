@@ -36,8 +36,7 @@ def test_blocks_and_boundaries_from_the_wrist_alone(performed, name):
     setup, said = SETUPS[name]
     rig = wrist_rig(setup, **said)
     trials = [read_trial(wrist_recording(s, setup, i), rig) for i, s in enumerate(performed)]
-    aligned = align(trials, TASK, rig)
-    errors = []
+    aligned, errors = align(trials, TASK, rig), []
     for simulated, found in zip(performed, aligned.segmentations, strict=True):
         assert found.failed is None
         errors += list(np.abs([s.end for s in found.spans[:-1]] - simulated.boundaries))
@@ -97,11 +96,9 @@ def test_a_grip_force_without_a_stiffness_does_not_tell_the_touch(creep):
 
 def test_a_grip_force_tells_the_width_and_bounds_friction(performed):
     setup = PLAIN
-    rig = wrist_rig(setup, grip_force="grip")
-    trials = []
+    rig, trials = wrist_rig(setup, grip_force="grip"), []
     for i, simulated in enumerate(performed):
-        columns = wrist_recording(simulated, setup, i)
-        pads = simulated.motion.force
+        columns, pads = wrist_recording(simulated, setup, i), simulated.motion.force
         squeeze = (pads[:, 0, 0] - pads[:, 1, 0]) / 2
         columns["grip"] = np.interp(columns["t"], simulated.t, np.maximum(squeeze, 0))
         trials.append(read_trial(columns, rig))
@@ -116,8 +113,7 @@ def test_the_tool_is_found_from_free_motion(performed):
     setup = Setup(mass=1.3, heading=0.5, tilt=0.15, offset=(4.0, -1.0, 2.0), reaction=True, noise=0.002)
     rig = wrist_rig(setup)
     trial = trial_of(frame_table(wrist_recording(performed[0], setup), None), rig, None)
-    pose = pose_of(trial, rig.gripper)
-    free = trial.t < 1.5
+    pose, free = pose_of(trial, rig.gripper), trial.t < 1.5
     tool = free_tool(trial, rig, pose, free)
     assert tool.mass == pytest.approx(1.3, rel=0.03) and np.linalg.det(tool.axes) == pytest.approx(-1)
     np.testing.assert_allclose(tool.axes, -np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), atol=0.1)
@@ -226,8 +222,7 @@ def test_touches_are_told_and_the_lift_tells_the_sign_of_readings_that_change_wi
 def test_halves_of_a_wrist_are_no_fingers(performed):
     simulated = performed[0]
     t = np.arange(int(simulated.t[-1] * 50)) / 50
-    motion = simulated.motion
-    columns = {"t": t}
+    motion, columns = simulated.motion, {"t": t}
     net = motion.force.sum(axis=1)
     for i in (0, 1):
         for k, axis in enumerate("xy"):

@@ -148,8 +148,7 @@ def test_rigs_without_stiffness_and_the_papers_method_say_what_they_lack(tmp_pat
     found = document("identify", trial, *RIG_AND_TASK, "--method", "paper", out=tmp_path / "out.json")
     assert found["method"] == "paper" and found["trials"][0]["log_evidence"] is None
     assert found["properties"]["block1"]["width"]["mean"] < 0.0185  # short by what the pads give
-    rig = tmp_path / "rig.toml"
-    text = (NONE / "rig.toml").read_text()
+    rig, text = tmp_path / "rig.toml", (NONE / "rig.toml").read_text()
     rig.write_text(re.sub(r"(?m)^(normal|shear)_stiffness.*$", "", text))
     args = (str(NONE / "trial_01.csv"), "--task", str(NONE / "task.toml"), "--rig", str(rig))
     warnings = "; ".join(document("identify", *args, out=tmp_path / "out.json")["warnings"])

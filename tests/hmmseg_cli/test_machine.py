@@ -120,8 +120,7 @@ def tortured(lab, name, kind, monkeypatch, capsys, most):
     module, attribute, error, counted = CALLS[kind]
     real, before = getattr(module, attribute), files(lab)
     assert run(name, monkeypatch) == 0  # everything is imported, and kept that is kept
-    whole = files(lab)
-    count = Refusing(real, error, counted=counted)
+    whole, count = files(lab), Refusing(real, error, counted=counted)
     with monkeypatch.context() as patched:
         patched.setattr(module, attribute, count)
         restore(lab, before)
@@ -132,8 +131,7 @@ def tortured(lab, name, kind, monkeypatch, capsys, most):
         with monkeypatch.context() as patched:
             patched.setattr(module, attribute, Refusing(real, error, at, counted))
             code = run(name, patched)
-        err = capsys.readouterr().err
-        found = files(lab)
+        err, found = capsys.readouterr().err, files(lab)
         assert code in ((130,) if isinstance(error, KeyboardInterrupt) else (0, 2)), (at, err)
         assert found.keys() in (before.keys(), whole.keys()), (at, found.keys() ^ before.keys())
         assert code != 130 or found == {name: whole[name] for name in found}, at
@@ -157,8 +155,7 @@ def test_whichever_call_is_refused(name, kind, lab, monkeypatch, capsys):
 
 def test_whatever_the_machine_refuses_results_of_before_stay_and_folders_are_named(lab, monkeypatch, capsys):
     assert main(COMMANDS["fit"]) == 0
-    before = files(lab)
-    real = os.replace
+    before, real = files(lab), os.replace
     with monkeypatch.context() as patched:
         patched.setattr(os, "replace", Refusing(real, FULL, 1, lambda new, to: ".old" not in str(new)))
         assert main([*COMMANDS["fit"], "--seed", "3"]) == 2
@@ -223,7 +220,6 @@ def test_a_page_watched_in_the_terminal_leaves_standard_output_alone(lab):
     main_end, terminal = pty.openpty()  # standard error is a terminal, as a user has it
     run = subprocess.Popen(["bash", "-c", script], stdin=subprocess.PIPE, stderr=terminal)
     os.close(terminal)
-    assert run.stdin is not None
     run.stdin.write(b"".join(rows))
     run.stdin.close()
     with contextlib.suppress(OSError):
@@ -285,8 +281,7 @@ def test_ctrl_c_at_any_moment(name, lab, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    usual = signal.signal(signal.SIGALRM, interrupt)
-    rng = np.random.default_rng(7)
+    usual, rng = signal.signal(signal.SIGALRM, interrupt), np.random.default_rng(7)
     try:
         for moment in rng.uniform(0.02, 1.0, 4) * length:
             restore(lab, before)

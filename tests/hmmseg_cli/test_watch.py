@@ -74,8 +74,7 @@ def test_degrees_and_ms_are_refused_as_in_a_file(run):
 
 
 def test_a_stream_as_a_spreadsheet_has_it(run):
-    plain = run(ROWS[:60])[1]
-    table = [row.split(",") for row in ROWS[:60]]
+    plain, table = run(ROWS[:60])[1], [row.split(",") for row in ROWS[:60]]
     units = ["" if name == "t" else "N" if name[0] == "f" else "rad/s" if name[0] == "d" else "rad"
              for name in table[0]]  # fmt: skip
     start = datetime.fromisoformat("2026-03-02T10:15:30+01:00")

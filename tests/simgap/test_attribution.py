@@ -87,8 +87,7 @@ def enumerated(gap: Gap) -> dict[tuple[int, ...], float]:
     inner, pull = columns.T @ columns, columns.T @ gap.residual
     out, z = {}, gap.nuisance.shape[1]
     for effects in itertools.chain.from_iterable(itertools.combinations(range(4), k) for k in range(3)):
-        mine = [*range(z), *(z + j for j in effects)]
-        each = []
+        mine, each = [*range(z), *(z + j for j in effects)], []
         for at in itertools.product(range(grid.size), repeat=len(effects)):
             prior = np.concatenate([np.ones(z), np.exp(grid[list(at)])])
             h = inner[np.ix_(mine, mine)] + np.diag(prior)
@@ -154,8 +153,7 @@ def test_the_bayes_factor_bounds_alarms_and_healthy_recordings_are_taken_until_i
 
 def test_neighbours_are_screened_by_what_one_step_of_each_gives():
     f = forms(gap_of({0: 3.0, 2: -2.0}))
-    m = fitted(f, (0,))
-    sets = [(), (0, 2), (1,), (1, 3), (0, 1, 2)]
+    m, sets = fitted(f, (0,)), [(), (0, 2), (1,), (1, 3), (0, 1, 2)]
     each = [mode(f, quadratic_forms(f, e), m.precision, steps=1).score for e in sets]
     # but for the volume of the mode, by how groups count before the step
     np.testing.assert_allclose(screened(f, m, sets), each, atol=0.2)
@@ -205,8 +203,7 @@ def test_of_a_planted_cell_and_effect_size_and_share_are_told():
     assert (value.mean == pytest.approx(3.0, abs=4 * value.sd)
             and found.effects["b"].probability > 0.93 * RECORD)  # fmt: skip
     assert found.effects["b"].share > 0.8 and found.remainder.share < 0.1 and found.remainder.p_value > 0.05
-    assert found.how_far is not None and found.how_far.fraction > 0.8
-    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert found.how_far.fraction > 0.8 and sum(found.probabilities.values()) == pytest.approx(1.0)
     assert {(c.channel) for c in found.where} <= {"c0", "c1"}
 
 
@@ -294,15 +291,13 @@ def test_a_noise_stated_too_low_is_no_gap_and_small_groups_have_the_level_of_the
 def test_how_far_covers_what_was_planted_and_causes_are_what_other_trials_need():
     gap = gap_of({0: 4.0}, seed=4)
     held = Heldout.of(forms(gap), np.ones(3), (0, 1))
-    assert held is not None
-    far = held.how_far((0,))
-    push = gap.candidates[0].jacobian[:, 0] * 4.0
-    assert far is not None and far.noise_floor == 1.0
+    far, push = held.how_far((0,)), gap.candidates[0].jacobian[:, 0] * 4.0
+    assert far.noise_floor == 1.0
     assert far.before - 1 == pytest.approx(float(push @ push) / gap.residual.size, rel=0.35)
     assert far.interval_90[0] < far.fraction <= 1.0 and far.fraction > 0.85
     gap = gap_of({0: 4.0, 2: 3.0}, seed=4)
     held = Heldout.of(forms(gap), np.ones(3), range(4))
-    assert held is not None and _predicting(held, (0, 1, 2, 3)) == (0, 2)
+    assert _predicting(held, (0, 1, 2, 3)) == (0, 2)
     assert held.gain((0, 2), (0,)) > 3 > held.gain((0, 1, 2), (0, 2))
 
 
@@ -310,7 +305,6 @@ def test_a_trial_is_predicted_with_all_that_the_others_leave_open():
     """Against the dense covariance of a trial's rows, all else as the others have it."""
     gap = gap_of({0: 2.0, 1: -1.0}, seed=2)
     held = Heldout.of(forms(gap), np.array([1.0, 1.3, 0.8]), (0, 1))
-    assert held is not None
     for effects in ((), (0,), (0, 1)):
         squares = held._squares(effects)[0]
         for k, (train, _) in enumerate(held.folds):
@@ -328,8 +322,7 @@ def test_what_is_of_one_trial_takes_nothing_off_the_held_out_share():
     rough = replace(gap, residual=gap.residual + of_trial @ [1.5, -2.0, 1.0, -1.0],
                     nuisance=np.concatenate([gap.nuisance, of_trial], 1))  # fmt: skip
     found = [Heldout.of(forms(g), np.ones(3), (0,)) for g in (gap, rough)]
-    plain, mixed = (h.how_far((0,)) for h in found if h is not None)
-    assert plain is not None and mixed is not None
+    plain, mixed = (h.how_far((0,)) for h in found)
     assert mixed.fraction == pytest.approx(plain.fraction, abs=0.05)
 
 
@@ -339,7 +332,7 @@ def test_what_one_trial_alone_says_or_changes_sign_between_trials_is_no_cause():
     for where, causes in ((own, (0,)), (np.ones_like(own), (0, 2))):
         more = 6.0 * push * where
         held = Heldout.of(forms(replace(gap, residual=gap.residual + more)), np.ones(3), range(4))
-        assert held is not None and held.gain((0, 2), (0,)) > 3 and _predicting(held, (0, 2)) == causes
+        assert held.gain((0, 2), (0,)) > 3 and _predicting(held, (0, 2)) == causes
     gap = gap_of({}, seed=5)
     push, own = gap.candidates[0].jacobian[:, 0], gap.rows.trial == 1
     residual = gap.residual + np.where(own, 12.0 * push, 0.0)
@@ -379,8 +372,7 @@ def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
     part = rows.channel * len(rows.parts) + rows.part
     held, plain, widened = [], [], []
     for seed in range(60):
-        rng = np.random.default_rng(seed)
-        push = np.ones(rows.time.size)
+        rng, push = np.random.default_rng(seed), np.ones(rows.time.size)
         sizes = 2.0 * (1 + wander * rng.standard_normal(6))
         residual = rng.standard_normal(rows.time.size) + sizes[part] * push
         f = forms(Gap(rows, residual, np.zeros((rows.time.size, 0)), (linear("a", push[:, None]),)))
@@ -401,8 +393,7 @@ def test_a_measurement_that_trials_contradict_is_named_though_no_trial_is_predic
     residual = np.random.default_rng(0).standard_normal(rows.time.size) + 9.0 * column[:, 0]
     wrong = linear("measured", column, scale=10.0)
     found = attribute(Gap(rows, residual, column, (wrong, linear("other", column[::-1].copy()))))
-    assert (found.verdict, found.causes) == ("named", ("measured",))
-    assert found.how_far is not None and found.how_far.fraction > 0.9
+    assert (found.verdict, found.causes) == ("named", ("measured",)) and found.how_far.fraction > 0.9
 
 
 def one(name: str, weight: float, known: float = 1.0, causes: tuple[str, ...] | None = None) -> Explanation:
@@ -504,7 +495,7 @@ def test_what_is_known_of_a_random_effect_from_elsewhere_no_form_imitates():
     for evidence, kept in ((400.0, True), (0.0, False)):
         f = forms(replace(gap, candidates=(*gap.candidates, replace(lattice, evidence=evidence))))
         others = Heldout.of(f, np.ones(3), (0, 4))
-        assert others is not None and (4 in _predicting(others, (0, 4))) == kept
+        assert (4 in _predicting(others, (0, 4))) == kept
 
 
 def problem(seed, size=6, tight=1.0):

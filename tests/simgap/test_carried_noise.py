@@ -22,8 +22,7 @@ GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
 
 def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
     """A place that a force moves, place = (GIVE + true) force, with noise; the effect is another give."""
-    rng = np.random.default_rng(seed)
-    n = TRIALS * SAMPLES
+    rng, n = np.random.default_rng(seed), TRIALS * SAMPLES
     trial, k = np.divmod(np.arange(n), SAMPLES)
     nothing = np.zeros(n, int)
     rows = Rows(trial, nothing, nothing, k / 20.0, tuple(f"t{i}" for i in range(TRIALS)), ("c",), ("p",))
@@ -40,7 +39,6 @@ def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
             columns = np.stack([place - GIVE * force, np.zeros(n), force], 1) / sd + one
         else:
             draws.append(one)
-    assert columns is not None
     far, zero = np.full(1, np.inf), np.zeros(1)
     pad = Candidate("softer", ("give",), zero, zero, np.ones(1), columns[:, 1], columns[:, 2:], -far, far)
     return Gap(rows, columns[:, 0], np.zeros((n, 0)), (pad,), carried=np.stack(draws) / np.sqrt(len(draws)))
@@ -51,9 +49,7 @@ def linearised(gap: Gap) -> Gap:
     (pad,) = gap.candidates
     own = pad.jacobian[:, 0]
     at = np.array([own @ gap.residual / (own @ own)])
-    more = replace(pad, at=at, shift=own * at[0])
-    assert gap.carried is not None
-    noise = gap.carried.copy()
+    more, noise = replace(pad, at=at, shift=own * at[0]), gap.carried.copy()
     noise[:, :, 1] = at[0] * noise[:, :, 2]
     return replace(gap, candidates=(more,), carried=noise)
 
@@ -61,8 +57,7 @@ def linearised(gap: Gap) -> Gap:
 def test_products_of_noise_are_their_expectations():
     gap = linearised(softer(0.0, 0.0))
     s, (pad,) = spectrum(gap), gap.candidates
-    found = of_noise(gap, s)[:, :, :].sum(0)
-    variance = np.hypot(PLACE_SD, GIVE * FORCE_SD) ** 2
+    found, variance = of_noise(gap, s)[:, :, :].sum(0), np.hypot(PLACE_SD, GIVE * FORCE_SD) ** 2
     n, at = gap.residual.size, pad.at[0]
     with_residual, square = -GIVE * FORCE_SD**2 / variance * n, FORCE_SD**2 / variance * n
     # About `at`: d0'J stays, the constant part is at J - at J, and no curvature is taken off.
@@ -74,16 +69,12 @@ def test_products_of_noise_are_their_expectations():
 
 
 @pytest.mark.parametrize("error", [0.0, 1.0])
-def test_noise_alone_is_no_effect(error):
+def test_noise_alone_is_no_effect_and_an_effect_has_its_own_size(error):
     gap = linearised(softer(0.0, 1.0, error=error))
     blind, told = forms(replace(gap, carried=None)), forms(gap)
     gained = [fitted(f, (0,)).score - fitted(f, ()).score for f in (blind, told)]
     assert gained[0] > 25.0  # stiffer pads leave less of the force's noise
     assert gained[1] < 2.0
-
-
-@pytest.mark.parametrize("error", [0.0, 1.0])
-def test_an_effect_has_its_own_size(error):
     found = []
     for seed in range(6):
         gap = linearised(softer(0.5, 4.0, seed, error))
@@ -118,7 +109,7 @@ def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(giv
     monkeypatch.setattr(assemble, "SHOWN", (min(size) if shown > 1 else max(size)) / shown)
     gap = gap_of(measured, healthy, [], (), redrawn(measured))
     names = [p for c in gap.candidates for p in c.parameters]
-    assert gap.carried is not None and gap.carried.shape[2] == gap.raw_columns.shape[1]
+    assert gap.carried.shape[2] == gap.raw_columns.shape[1]
     assert len(names) == (given.sd.size if shown > 1 else 0)
 
 

@@ -24,8 +24,7 @@ def test_a_drop_falls_as_galileo_says_and_a_block_slides_with_the_closed_form_ac
     tilt = float(np.arctan(1.5 * 0.5))
     constants = scene(tilt=tilt)
     path = evolve(constants, at(constants, (0.0, 0.008)), FAR, 2.5e-4, 4000)
-    speed = np.hypot(path.vx[0], path.vy[0])
-    expected = G * (np.sin(tilt) - 0.5 * np.cos(tilt))
+    speed, expected = np.hypot(path.vx[0], path.vy[0]), G * (np.sin(tilt) - 0.5 * np.cos(tilt))
     assert float(speed[-1] - speed[1999]) / (2000 * 2.5e-4) == pytest.approx(expected, rel=1e-3)
 
 
@@ -56,16 +55,14 @@ def test_a_spring_converges_at_second_order_and_a_damped_one_at_first_or_better(
 @pytest.mark.parametrize("share", [0.5, 0.99])
 def test_a_block_sticks_on_an_incline_below_the_angle_of_friction(share):
     tilt = float(np.arctan(share * 0.5))
-    constants = scene(tilt=tilt)
-    height = 0.008 / np.cos(tilt)
+    constants, height = scene(tilt=tilt), 0.008 / np.cos(tilt)
     path = evolve(constants, at(constants, (0.0, height - 2e-6)), FAR, 2.5e-4, 40000)
     settled = path.x[0][4000:]
     assert float(jnp.ptp(settled)) < 1e-9  # ten seconds, no creep
 
 
 def test_energy_is_kept_by_an_undamped_bounce_and_never_made_by_contact():
-    constants = scene(support_damping=0.0)
-    spread = []
+    constants, spread = scene(support_damping=0.0), []
     for h in (1e-4, 5e-5, 2.5e-5):
         path = evolve(constants, at(constants, (0.0, 0.0085)), FAR, h, round(2.0 / h))
         held = jax.vmap(lambda s: energy(constants, s, FAR))(path)

@@ -176,8 +176,7 @@ def _slow(force, time: float):
 
 def _recorded(force_of, time: float, n: int) -> np.ndarray:
     """Forces (n,) after an exact low-pass on a grid a hundred times finer."""
-    fine = np.arange(100 * n) * STEP / 100
-    keep = np.exp(-STEP / 100 / time)
+    fine, keep = np.arange(100 * n) * STEP / 100, np.exp(-STEP / 100 / time)
     return np.asarray(lfilter([1 - keep], [1, -keep], force_of(fine)))[::100]
 
 
@@ -199,8 +198,7 @@ def test_smooth_forces_are_found_behind_a_low_pass(time):
 
 
 def test_a_corner_behind_a_low_pass_is_in_doubt_and_no_force_comes_before_its_contact():
-    t = np.arange(60) * STEP
-    onset = 20.4 * STEP
+    t, onset = np.arange(60) * STEP, 20.4 * STEP
 
     def force(at):
         return 4.0 * np.maximum(at - onset, 0.0)
@@ -240,8 +238,7 @@ def test_values_between_samples_are_cubic_and_at_their_own_samples_themselves():
 
 @pytest.mark.parametrize("steps", [0.4, 2.4])
 def test_a_late_force_is_in_doubt_where_it_is_read(steps):
-    world = world_of(performance(600))
-    force = np.where(np.arange(60) >= 30, 2.0, 0.0)
+    world, force = world_of(performance(600)), np.where(np.arange(60) >= 30, 2.0, 0.0)
     world = world._replace(force=np.repeat(force[None, :, None], 4, axis=2),
                            delay=np.asarray(steps) * np.median(world.t[:, 1:] - world.t[:, :-1]),
                            modes=np.eye(6)[LATE])  # fmt: skip
@@ -253,8 +250,7 @@ def test_a_late_force_is_in_doubt_where_it_is_read(steps):
 
 def test_a_support_settles_like_a_spring_beside_a_damper():
     n, time, give = 60, 0.04, 4e-4
-    world = world_of(performance(10 * n))
-    t = np.arange(n) * STEP
+    world, t = world_of(performance(10 * n)), np.arange(n) * STEP
     carry = ((t > 1.0) & (t < 2.0)).astype(float)
     world = world._replace(give_support=np.asarray(give), support_time=np.asarray(time),
                            carry=np.asarray(carry)[None], free=np.zeros((1, n)),

@@ -32,8 +32,7 @@ def performance(n: int = 400) -> Performance:
     t = np.arange(n) * 5e-3
     x, y = 0.12 + 0.02 * np.sin(3 * t), 0.03 + 0.01 * np.cos(2 * t)
     position = np.stack([np.stack([x - 0.01, y], 1), np.stack([x + 0.01, y], 1)], 1)
-    velocity = np.gradient(position, t, axis=0)
-    grip = 2.0 / (1 + np.exp(-(t - 1.0) / 0.03))
+    velocity, grip = np.gradient(position, t, axis=0), 2.0 / (1 + np.exp(-(t - 1.0) / 0.03))
     force = np.stack([np.stack([grip, 0.2 * grip], 1), np.stack([-grip, 0.25 * grip], 1)], 1)
     held = (t > 1.2).astype(float)
     load, width = 0.5 * held, np.where(held > 0, 0.02, 1.0)
@@ -44,8 +43,7 @@ def world_of(p: Performance) -> World:
     """The world that the nominal hand records of a performance, every tenth sample."""
     k = slice(None, None, 10)
     joints = np.concatenate([inverse(RIG.finger(i), i, p.position[k, i - 1]) for i in (1, 2)], 1)
-    rates = np.gradient(joints, p.t[k], axis=0)
-    held = (p.t[k] > 1.0).astype(float)
+    rates, held = np.gradient(joints, p.t[k], axis=0), (p.t[k] > 1.0).astype(float)
     carry = ((p.t[k] > 1.2) & (p.t[k] < 1.6)).astype(float)
     one, zero = np.ones(()), np.zeros(())
     return World(t=p.t[k][None], joints=joints[None], rates=rates[None], force=flat(p)[k][None],
@@ -157,8 +155,7 @@ def test_what_is_nearest_to_the_recorded_number_is_put_in_last_and_taken_out_fir
 def test_pads_that_carry_a_block_hold_it_and_quantised_forces_lie_on_the_lattice():
     # Friction far too low to hang a block from would let all of its heights go free.
     world, slip = world_of(performance()), catalogue()["grip_slip"]
-    low = slip.correct(world, {"mu": 0.08}, 1.0)
-    carried = np.asarray(world.carry)
+    low, carried = slip.correct(world, {"mu": 0.08}, 1.0), np.asarray(world.carry)
     assert carried.sum() > 3 and (np.asarray(low.slip) * carried).sum() <= 0.2 * carried.sum()
     force = catalogue()["quantisation"].finish(np.array([0.013, -0.049, 1.234]), {"step": 0.02})
     np.testing.assert_allclose(force, [0.02, -0.04, 1.24])

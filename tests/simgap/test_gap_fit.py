@@ -102,7 +102,7 @@ def test_the_better_of_two_joint_fits_counts(healthy, monkeypatch):
     monkeypatch.setattr(diagnose, "fit", recorded_start)
     found = SimpleNamespace(problem=given, healthy=plain)
     joint, own = diagnose._leading(found, f, best), alone.columns[given.num_common :]
-    assert joint is not None and joint.u is starts[1]
+    assert joint.u is starts[1]
     np.testing.assert_allclose(starts[0][own], f.gap.candidates[0].at)
     np.testing.assert_allclose(starts[1][: given.num_common], best.x[: given.num_common])
     assert np.abs(starts[1][own]).max() < 0.05  # a healthy hand's
@@ -125,7 +125,6 @@ def test_quantisation_is_seen_and_not_imagined(healthy):
     given, found = healthy
     assert not scatters(given, found.residual, ["quantisation"])
     finish = effect_named("quantisation").finish
-    assert finish is not None
     rounded = tuple(finish(force, {"step": 0.04}) for force in given.frame.forces)
     coarse = replace(given, frame=replace(given.frame, forces=rounded))
     (seen,) = scatters(coarse, found.residual, ["quantisation"])
@@ -160,8 +159,7 @@ def simulated():
 def test_properties_without_an_effect_are_those_identified(source):
     """Each within one standard deviation of what `identify` says: two summaries of the same samples."""
     aligned = source()
-    found = identify_aligned(aligned)
-    given = problem(build(aligned))
+    found, given = identify_aligned(aligned), problem(build(aligned))
     healthy = fit(given, (), neutral(given))
     values = given.properties(healthy.u)
     assert len(found.names) == 6

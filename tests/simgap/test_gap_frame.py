@@ -106,8 +106,7 @@ def test_a_grip_is_firm_where_it_is_usual_and_a_start_off_a_support_is_in_doubt(
     assert (grips([])[10:] > 0.95).all()
     grip = np.full((1, 20), 0.5 * HELD)
     assert (np.asarray(firmness(grip, np.ones_like(grip), np.asarray(MOVES))) < 0.1).all() and 0 < LOOSE < 1
-    t = np.arange(12) * 0.05
-    force = np.zeros((12, 4))
+    t, force = np.arange(12) * 0.05, np.zeros((12, 4))
     force[6:, 1] = 0.8  # N; the weight comes onto one finger within a sample
     free, starting = np.zeros(12, bool), t == t[6]
     doubt = between_samples(t, force, free, starting, np.array([t[6]]))

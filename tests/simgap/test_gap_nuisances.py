@@ -51,7 +51,6 @@ def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
     rows = Rows(trial, channel, given.frame.arrays.subtask[trial, sample], given.frame.world.t[trial, sample],
                 given.frame.files, CHANNELS, tuple(map(str, range(len(given.frame.steps)))))  # fmt: skip
     sd = with_noise(given, rows, np.random.default_rng(2).standard_normal(trial.size)).sd
-    assert sd is not None
     for c, name in enumerate(CHANNELS):
         low, high = (0.55, 1.5) if name in ("vx", "vy") else (0.9, 1.1)
         assert low < np.sqrt(np.mean(sd[channel == c] ** 2)) < high, name
@@ -125,8 +124,7 @@ def test_columns_of_late_speeds_hold_no_noise_of_the_speeds(given):
 
 
 def test_a_block_that_turns_frees_all_but_where_it_stands(given):
-    free = np.zeros(given.weight.shape)
-    there = given.there
+    free, there = np.zeros(given.weight.shape), given.there
     free[there] = turned_variance(given, 0.02)
     phase = given.frame.arrays.phase
     for c, name in enumerate(CHANNELS):
@@ -173,8 +171,7 @@ def test_a_block_that_a_moving_hand_takes_along_stays_there(given):
     world, arrays, step = given.frame.world, given.frame.arrays, 4e-4
     x, stands = CHANNELS.index("x"), arrays.phase[0, :, Phase.PICKUP] * arrays.there[0, :, 0] > 0
     mine = np.flatnonzero(stands)[: np.flatnonzero(np.diff(np.flatnonzero(stands)) > 1)[0] + 1]
-    at = mine[mine.size // 2]
-    by = np.zeros(world.t.shape)
+    at, by = mine[mine.size // 2], np.zeros(world.t.shape)
     by[0, at:] = step
     left = {}
     for seen in (0.0, step):
@@ -204,8 +201,7 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
 
 
 def test_a_finger_that_still_presses_harder_is_no_gap_and_forces_in_balance_may_be_one():
-    t = np.arange(10) / 20.0
-    force = np.zeros((10, 4))
+    t, force = np.arange(10) / 20.0, np.zeros((10, 4))
     force[0] = -0.065, 0.02, -0.30, -0.41  # the right finger leaves last, while the left one rings
     force[1] = 0.3, 0.2, -0.3, 0.2  # late forces of both
     found = _one_finger(t, force, np.zeros(10, int), np.ones(10, bool), np.array([0.0]), np.full(10, 0.01))

@@ -35,8 +35,7 @@ def alike():
 
 
 def test_features_have_known_values_and_each_belongs_to_one_channel_or_is_a_duration(alike):
-    t = np.array([0.0, 1.0, 3.0])
-    values = np.array([0.0, 2.0, 0.0])
+    t, values = np.array([0.0, 1.0, 3.0]), np.array([0.0, 2.0, 0.0])
     found = means(t, values, np.array([0.0, 0.5, 2.0, 3.0]))
     np.testing.assert_allclose(found, [0.5, (0.75 + 1.5) / 1.5, 0.5])
     power = (transformed(0.3 * np.random.default_rng(0).standard_normal((4000, 50))) ** 2).mean(0)
@@ -113,7 +112,7 @@ def test_rings_begin_at_their_event_and_are_recovered_with_their_interval():
         wave = size * np.exp(-0.06 * 2 * np.pi * 7.4 * t) * np.sin(2 * np.pi * 7.4 * t + phase)
         rings.append(wave + 0.3 * t - 0.1 * t**2 + 0.02 * rng.standard_normal(t.size))
     found = fit_ring(from_swing(rings), 200.0)
-    assert found is not None and found.frequency_90[0] < 7.4 < found.frequency_90[1]
+    assert found.frequency_90[0] < 7.4 < found.frequency_90[1]
     assert found.damping_90[0] < 0.06 < found.damping_90[1]
     assert found.frequency_90[1] - found.frequency_90[0] < 0.1
     assert fit_ring(np.tile(np.exp(-3 * t), (4, 1)), 200.0) is None  # a course is no ring
@@ -187,8 +186,7 @@ def test_missing_samples_are_bridged_and_rates_may_differ(alike):
     sim, second = ensemble(rng, 5, None, Scatter(rate=1000.0, noise=0.02 * np.sqrt(10)), "sim")
     lay = layout(align(real, sim, TASK, boundaries=first | second))
     assert lay.rate == pytest.approx(100, rel=1e-3)
-    found = both(lay)
-    top = lay.kind == FAST
+    found, top = both(lay), lay.kind == FAST
     assert np.abs(found[0].mean(0) - found[1].mean(0))[top].mean() < 0.6  # averaged, not picked
 
 

@@ -107,8 +107,7 @@ def files(tmp_path):
 
 
 def loaded(files, *candidates: str):
-    found = load_mjcf(*files(), candidates)
-    t = np.arange(0, 2, 0.01)
+    found, t = load_mjcf(*files(), candidates), np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.1 * np.cos(6.9 * t), "u": np.zeros(t.size)})
     return found, log, found.effects([log])
 
@@ -130,7 +129,6 @@ def test_a_window_is_the_linear_pendulum(files, share):
     simulator.simulate(heavy, log, {"q": 0.1, "q_rate": 0.0})  # leaves no trace
     nominal["drive.gravity_compensation"] = share
     (channels,) = simulator.simulate_many([Job(nominal, window, {"q": 1e-3, "q_rate": -2e-3})])
-    assert channels is not None
     inertia = 0.5 * 0.2**2 + 0.4 * 0.5 * 0.01**2
     omega = np.sqrt((1 - share) * 0.5 * 9.81 * 0.2 / inertia)
     t = window.t - window.t[0]
@@ -267,7 +265,6 @@ def test_delayed_commands_step_when_they_are_carried_out(files):
     t = log.t + 1e-3 * rng.uniform(-1, 1, log.t.size)
     log = Recording("a.csv", t, {"q": log["q"], "u": rng.normal(size=t.size)})
     late = effects_of(found.simulator, [log], effects)["command.delay"].command
-    assert late is not None
     window = late(log, {"delay": 0.0123}).window(40, 80)
     times = np.arange(0, float(window.t[-1] - window.t[0]), 1e-3)
     since = np.array([window.t - window.t[0]])
@@ -317,8 +314,7 @@ def test_another_integrator_errs_as_the_numerics_say(files, own, name, other):
 @pytest.mark.parametrize("name", SET)
 def test_a_patched_model_is_the_one_that_was_simulated(files, name):
     paths = files(SERVO.replace('gravity="0 0 0"', "").replace("</worldbody>", TIE) % "", TURN)
-    found = load_mjcf(*paths)
-    t = np.arange(0, 2, 0.01)
+    found, t = load_mjcf(*paths), np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.3 * np.sin(6 * t), "u": 0.3 * np.sin(6 * t)})
     effects, simulator = effects_of(found.simulator, [log], found.effects([log])), found.simulator
     composed = Composed.of(simulator, [log], effects, noises(simulator, [log]))

@@ -87,8 +87,7 @@ def test_links_are_corrected_in_place_and_nothing_is_written_without_a_cause():
 def test_a_corrected_model_reproduces_the_recording_better(effects):
     values = {name: {k: v for k, (v, _) in table.items()} for name, table in effects.items()}
     truth = performed(STACK, HAND, [BLOCKS], [5], values)[0]
-    trial = recorded(truth, STACK, HAND, values)
-    boundaries = truth.boundaries
+    trial, boundaries = recorded(truth, STACK, HAND, values), truth.boundaries
     before = replay(trial, STACK, HAND, BLOCKS, boundaries=boundaries)
     rig = parse_rig(tomllib.loads(files(RIG, found(effects))["rig.toml"]))
     after = replayed(trial, STACK, rig, BLOCKS, boundaries)

@@ -231,58 +231,57 @@ def test_a_session_replaces_no_file(session, tmp_path):
     assert (tmp_path / "rig.toml").read_text() == "rate = 7" and len(list(tmp_path.iterdir())) == 6
 
 
-@pytest.mark.slow
-def test_a_mouse_in_a_real_browser_stacks_the_blocks(tmp_path):
+@pytest.fixture
+def page(tmp_path):
     if find_browser() is None:
         pytest.skip("no Chromium on this machine")
     with served(tmp_path) as address, browser(address) as page:
-        stack(page, "block1", "block2")
-        (x1, y1), (x2, _) = page.value("frame.worlds[0].blocks")
-        assert save(page).endswith("trial_01.csv")
+        yield page
+
+
+@pytest.mark.slow
+def test_a_mouse_in_a_real_browser_stacks_the_blocks(page, tmp_path):
+    stack(page, "block1", "block2")
+    (x1, y1), (x2, _) = page.value("frame.worlds[0].blocks")
+    assert save(page).endswith("trial_01.csv")
     assert y1 == pytest.approx(PAPER_BLOCKS["block2"].height + PAPER_BLOCKS["block1"].height / 2, abs=3e-4)
     assert abs(x1 - x2) < 3e-3
     check_identified(tmp_path)
 
 
 @pytest.mark.slow
-def test_two_touches_in_a_real_browser_lift_a_block(tmp_path):
-    if find_browser() is None:
-        pytest.skip("no Chromium on this machine")
-    with served(tmp_path) as address, browser(address) as page:
-        page.until("scene && frame && frame.t > 0.3")
-        x, y = page.value("frame.worlds[0].blocks[0]")
-        wide, half = page.value("scene.home")[1], page.value("Object.values(scene.blocks)[0][0]") / 2
-        page.touch("touchStart", (x - half - 0.015, wide), (x + half + 0.015, wide))
-        page.wait(0.8, False)
-        left, right = page.value("frame.worlds[0].tips")
-        assert right[0] - left[0] > 2 * half + 0.015
-        for apart, height in ((0.015, y), (-0.008, y), (-0.008, y + 0.012)):
-            page.touch("touchMove", (x - half - apart, height), (x + half + apart, height))
-            page.wait(1.0, False)
-        assert (page.value("frame.worlds[0].force[0][0]") > 1.0
-                and page.value("frame.worlds[0].force[1][0]") < -1.0)  # fmt: skip
-        assert page.value("frame.worlds[0].blocks[0][1]") - y > 0.005
+def test_two_touches_in_a_real_browser_lift_a_block(page):
+    page.until("scene && frame && frame.t > 0.3")
+    x, y = page.value("frame.worlds[0].blocks[0]")
+    wide, half = page.value("scene.home")[1], page.value("Object.values(scene.blocks)[0][0]") / 2
+    page.touch("touchStart", (x - half - 0.015, wide), (x + half + 0.015, wide))
+    page.wait(0.8, False)
+    left, right = page.value("frame.worlds[0].tips")
+    assert right[0] - left[0] > 2 * half + 0.015
+    for apart, height in ((0.015, y), (-0.008, y), (-0.008, y + 0.012)):
+        page.touch("touchMove", (x - half - apart, height), (x + half + apart, height))
+        page.wait(1.0, False)
+    assert (page.value("frame.worlds[0].force[0][0]") > 1.0
+            and page.value("frame.worlds[0].force[1][0]") < -1.0)  # fmt: skip
+    assert page.value("frame.worlds[0].blocks[0][1]") - y > 0.005
 
 
 @pytest.mark.slow
-def test_a_second_world_in_a_real_browser_is_seen_and_felt(tmp_path):
-    if find_browser() is None:
-        pytest.skip("no Chromium on this machine")
-    with served(tmp_path) as address, browser(address) as page:
-        page.until("scene && frame && frame.t > 0.3")
-        assert page.value("$('other').hidden") and page.value("frame.worlds.length") == 1
-        page.choose("effect", "force_gain")
-        page.until("Object.keys(scene.effects).length === 1 && frame.worlds.length === 2 && frame.t > 0.3")
-        assert not page.value("$('other').hidden") and page.value("$('other').width") > 200
-        x, y = page.value("frame.worlds[0].blocks[0]")
-        for kind in ("mouseMoved", "mousePressed"):
-            page.mouse(kind, x, y)
-            page.wait(1.2, False)
-        gain = page.value("scene.effects.force_gain.gain")
-        one, other = (world["force"][0][0] for world in page.value("frame.worlds"))
-        assert one > 1.0 and other / one == pytest.approx(1 + gain, rel=0.05)
-        page.choose("effect", "")
-        page.until("frame.worlds.length === 1 && $('other').hidden")
+def test_a_second_world_in_a_real_browser_is_seen_and_felt(page):
+    page.until("scene && frame && frame.t > 0.3")
+    assert page.value("$('other').hidden") and page.value("frame.worlds.length") == 1
+    page.choose("effect", "force_gain")
+    page.until("Object.keys(scene.effects).length === 1 && frame.worlds.length === 2 && frame.t > 0.3")
+    assert not page.value("$('other').hidden") and page.value("$('other').width") > 200
+    x, y = page.value("frame.worlds[0].blocks[0]")
+    for kind in ("mouseMoved", "mousePressed"):
+        page.mouse(kind, x, y)
+        page.wait(1.2, False)
+    gain = page.value("scene.effects.force_gain.gain")
+    one, other = (world["force"][0][0] for world in page.value("frame.worlds"))
+    assert one > 1.0 and other / one == pytest.approx(1 + gain, rel=0.05)
+    page.choose("effect", "")
+    page.until("frame.worlds.length === 1 && $('other').hidden")
 
 
 def test_the_command_ends_with_its_terminal(tmp_path):
@@ -292,7 +291,6 @@ def test_the_command_ends_with_its_terminal(tmp_path):
     command = [sys.executable, "-c", program, "play", "--no-open", "--output", str(tmp_path / "o")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stdout is not None
             next(line for line in process.stdout if "http://127.0.0.1:" in line)
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=60)

@@ -45,8 +45,7 @@ def recorded(motion: str, seed: int, changed: dict[str, float]) -> Recording:
     on = np.where((motion == "drop") & (t > 1), 0.0, 1.0)
     columns = {"goal": goal, "volts": np.full(t.size, 12.0), "on": on, "position": np.zeros(t.size)}
     nominal = {n: p.nominal for n, p in SIMULATOR.parameters.items()} | TRUE | changed
-    start = {"position": 0.0, "position_rate": 0.0}
-    rng = np.random.default_rng(seed)
+    start, rng = {"position": 0.0, "position_rate": 0.0}, np.random.default_rng(seed)
     log = Recording(f"{motion}_{seed}.csv", t, columns)
     angle = SIMULATOR.simulate(nominal, log, start)["position"] + 0.001 * rng.normal(size=t.size)
     log = log.with_columns({"position": angle})
@@ -114,13 +113,20 @@ def test_the_next_experiment_is_the_motion_by_which_a_set_differs_most():
 
 
 @pytest.mark.slow
-def test_a_mass_is_named_or_in_a_set_with_length_and_its_interval_holds():
+def test_what_no_log_can_tell_apart_is_a_set_whose_intervals_hold():
     found = compared(mass=0.7)
     members = {c.effects for c in (found.best, *found.others)}
     assert ("mass",) in members and members <= {("mass",), ("length",)}
     mass = next(c for c in (found.best, *found.others) if c.effects == ("mass",))
     low, high = found.sizes(mass)["mass"]["interval_90"]
     assert low <= 0.7 <= high
+    old, new = logs(0), logs(50, mass=0.7)
+    every = effects_of(SIMULATOR, old)
+    effects = {n: replace(every[n], fitted=n == "coulomb") for n in ("mass", "coulomb")}
+    effects["twin"] = replace(every["mass"], name="twin")
+    found = changes(SIMULATOR, old, new, effects)
+    assert found.verdict == "set"
+    assert {c.effects for c in (found.best, *found.others)} == {("mass",), ("twin",)}
 
 
 def test_logs_of_a_robot_as_it_was_tell_nothing_of_its_arm():
@@ -132,17 +138,6 @@ def test_logs_of_a_robot_as_it_was_tell_nothing_of_its_arm():
 
     np.testing.assert_allclose(angles(arm=2.0), angles(), atol=1e-9)
     assert np.abs(angles(arm=2.0, mass=0.9) - angles(mass=0.9)).max() > 1e-3
-
-
-@pytest.mark.slow
-def test_what_no_log_can_tell_apart_is_a_set():
-    old, new = logs(0), logs(50, mass=0.7)
-    every = effects_of(SIMULATOR, old)
-    effects = {n: replace(every[n], fitted=n == "coulomb") for n in ("mass", "coulomb")}
-    effects["twin"] = replace(every["mass"], name="twin")
-    found = changes(SIMULATOR, old, new, effects)
-    assert found.verdict == "set"
-    assert {c.effects for c in (found.best, *found.others)} == {("mass",), ("twin",)}
 
 
 def test_a_single_wild_sample_is_found_and_is_no_cause_and_the_end_of_a_log_is_not_broken():

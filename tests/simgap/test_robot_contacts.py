@@ -32,8 +32,7 @@ class Posed:
 
 def tumbling(name: str = "log.csv") -> Recording:
     t = np.arange(0.0, 0.5, 0.01)
-    half = 1.5 * t
-    axis = np.array([0.6, 0.0, 0.8])
+    half, axis = 1.5 * t, np.array([0.6, 0.0, 0.8])
     turn = {"qw": np.cos(half)} | {f"q{a}": axis[k] * np.sin(half) for k, a in enumerate("xyz")}
     return Recording(name, t, {"x": 0.3 * t, "y": 0.1 + 0 * t, "z": 1 - 4.9 * t**2} | turn)
 
@@ -79,8 +78,7 @@ def test_brief_touches_count_but_breaks_do_not_and_what_slows_down_does_not_rest
     assert [bool(s) for s in told] == [bool(i in (2, 8, 9, 10)) for i in range(12)]
     t = np.arange(0, 1.0, 0.01)
     log = Recording("log.csv", t, {"q": np.where(t < 0.5, 1 - np.exp(-t / 0.1), 1 - np.exp(-5))})
-    rests = resting(log, {"q": 1.0})
-    rate = np.exp(-t / 0.1) / 0.1
+    rests, rate = resting(log, {"q": 1.0}), np.exp(-t / 0.1) / 0.1
     assert rests[t > 0.53].all() and not rests[(rate * 0.04 > AT_REST) & (t < 0.47)].any()
 
 
@@ -116,16 +114,14 @@ def dropped(tmp_path_factory):
 def test_flight_and_contact_are_told_apart(dropped):
     simulator, log = dropped
     times, what = simulator.contact_states(log)
-    fall = np.sqrt(2 * 0.45 / 9.81)
-    first = times[what.index(frozenset({(0, 1)}))]
+    fall, first = np.sqrt(2 * 0.45 / 9.81), times[what.index(frozenset({(0, 1)}))]
     assert fall - 0.03 < first < fall + 0.01 and not what[0]
     noise = dict.fromkeys(POSE, 1e-3)
     windows = cut(simulator, [log], noise, 0.2)
     assert windows[0].regime == FLIES and windows[-1].regime == RESTS
     assert {w.regime for w in windows} <= {FLIES, STRIKES, RESTS}
     assert any(abs(log.t[w.begin] - first) < 0.011 for w in windows)
-    phases = phases_of(simulator, [log], windows)
-    rows = rows_of([log], windows, noise)
+    phases, rows = phases_of(simulator, [log], windows), rows_of([log], windows, noise)
     names = np.array(phases.names)[phases.of(rows)]
     assert {*names} == {w.regime for w in windows} and all(names == np.array(REGIMES)[rows.regime])
 
@@ -196,8 +192,7 @@ def test_in_contact_a_fourth_of_the_step_by_another_integrator_is_the_run_itself
     point = {"option.timestep": {"timestep": -0.75}, "option.integrator": {"integrator": 1.0}}
     composed = Composed.of(found.simulator, [log], effects, {"q": 1e-4}).moved(point)
     composed = replace(composed, windows=tuple(replace(w, regime=STRIKES) for w in composed.windows))
-    starts = composed.starts(point)
-    finer = load(0.002, "Euler")
+    starts, finer = composed.starts(point), load(0.002, "Euler")
     finer.effects([log])
     for window, start, ours in zip(composed.windows, starts, composed.rolled(point, starts), strict=True):
         own = finer.simulator.simulate({}, log.window(window.begin, window.end), start)

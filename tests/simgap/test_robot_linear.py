@@ -7,7 +7,7 @@ import pytest
 from simgap_swing import Swing, log
 
 from hmmseg.errors import InputError
-from hmmseg.io.task import BlockTask, SequenceTask, parse_task
+from hmmseg.io.task import SequenceTask, parse_task
 from simgap.channels import delayed, lowpass
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
@@ -52,8 +52,7 @@ def test_windows_tile_every_log_and_run_across_no_gap():
 
 
 def test_starts_are_right_within_what_they_say_and_of_a_jerk_read_as_such():
-    t = np.linspace(0, 1, 201)
-    off = []
+    t, off = np.linspace(0, 1, 201), []
     for seed in range(200):
         values = 0.3 * np.sin(5 * t) + 1e-3 * np.random.default_rng(seed).standard_normal(t.size)
         (value, sd), (rate, rate_sd) = smoothed(t, values, 80, 1e-3)
@@ -96,8 +95,7 @@ def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
     if made.model:
         planted = log(3, noise=1e-9, **values)
     elif made.command is not None:
-        acted = made.command(recording, values)
-        robot = Swing()
+        acted, robot = made.command(recording, values), Swing()
         nominal = {n: p["nominal"] for n, p in robot.parameters.items()}
         planted = recording.with_columns({"angle": robot.simulate(nominal, acted)["angle"]})
     else:
@@ -118,7 +116,6 @@ def test_a_large_misreading_moves_starts_farther_than_along_straight_lines(name)
     ((short, p),) = model.effects[name].parameters.items()
     there = {short: p.nominal + 4 * p.sd}
     one = vary(model, base, name, at=there)
-    assert one is not None
     np.testing.assert_allclose(one.shift, base_at(model, {name: there}).rows - base.rows, atol=1e-12)
 
 
@@ -221,16 +218,14 @@ def test_noise_of_a_step_of_the_encoder_is_estimated(noise):
     """Of readings in steps a median of differences is a whole number of steps: 25 % too little."""
     t, rng = np.arange(6000) / 500, np.random.default_rng(0)
     read = 1e-4 * np.round(1e4 * np.sin(3 * t) + noise * rng.standard_normal(t.size))
-    wanted = 1e-4 * np.sqrt(noise**2 + 1 / 12)
-    log = Recording("log.csv", t, {"z": read})
+    wanted, log = 1e-4 * np.sqrt(noise**2 + 1 / 12), Recording("log.csv", t, {"z": read})
     assert estimate_noise([log], "z", 1e-4) == pytest.approx(wanted, rel=0.06)
 
 
 def still_then_swinging(seed: int, begin: float):
     found = log(seed, seconds=6.0)
     torque = np.where(found.t < begin, 0.0, found["torque"])
-    empty = found.with_columns({"torque": torque})
-    robot = Swing()
+    empty, robot = found.with_columns({"torque": torque}), Swing()
     angle = robot.simulate({n: p["nominal"] for n, p in robot.parameters.items()}, empty)["angle"]
     noise = 5e-4 * np.random.default_rng(seed).standard_normal(angle.size)
     return empty.with_columns({"angle": angle + noise})
@@ -255,7 +250,6 @@ def test_what_is_no_sequence_and_what_is_no_column_is_said():
     logs = [log(0)]
     blocks = parse_task({"objects": {"block1": {"on": "ground"}},
                          "moves": [{"object": "block1", "to": "ground"}]})  # fmt: skip
-    assert isinstance(blocks, BlockTask)
     with pytest.raises(InputError, match="task of blocks"):
         phases_by_task(logs, blocks)
     with pytest.raises(InputError, match="no column force; expected torque, angle"):

@@ -64,8 +64,7 @@ def test_what_repeats_share_makes_an_interval_as_wide_as_one_log_would(repeats: 
 
 
 def test_logs_are_repeats_where_commands_are_alike_and_count_each_where_the_model_is_right():
-    rng = np.random.default_rng(0)
-    still = np.zeros((LOGS, T.size))
+    rng, still = np.random.default_rng(0), np.zeros((LOGS, T.size))
     made = composed(still, rng, [1.0, 1.0, 2.0, 1.0, 2.0, 1.0005, 3.0, 1.0])
     assert made.motion == (0, 0, 1, 0, 1, 0, 2, 0) and made.repeats() == [5, 5, 2, 5, 2, 5, 1, 5]
     of_three = [k for k, w in enumerate(made.windows) if w.log in (0, 1, 6)]

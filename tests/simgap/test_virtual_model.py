@@ -113,8 +113,7 @@ def wall(stiffness: float, damping: float, controlled: bool, delay: int = 1) -> 
         held = queue.pop(0)
         if controlled:
             held = control.render(np.array([[held, 0.0], [0.0, 0.0]]), np.array([[x, 0.0], [0.0, 0.0]]))[0, 0]
-        decay = np.exp(-damping / mass * period)
-        end = -held / damping
+        decay, end = np.exp(-damping / mass * period), -held / damping
         step = end * period + (v - end) * mass / damping * (1 - decay)
         energy += held * step
         x, v = x + step, end + (v - end) * decay
@@ -157,8 +156,7 @@ def test_a_trial_shows_its_task_its_widths_and_heights_and_the_rig_s_noise(stack
     assert (np.diff(stacked.boundaries) > 0.1).all()
     signals = task_space(stacked.trial, RIG)
     touch, leave, meet, part = stacked.boundaries[:4]
-    t = signals.t
-    gripped = signals.grip > 0.1
+    t, gripped = signals.t, signals.grip > 0.1
     held = (t > touch + 0.06) & (t < part - 0.06)
     assert gripped[held].all() and not gripped[t < touch - 0.01].any()
     carried = (t > leave + 0.1) & (t < meet - 0.1)
