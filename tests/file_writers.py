@@ -116,15 +116,6 @@ def planted(gap: tuple[int, int] = (0, 0)) -> list[Topic]:
             Topic("/pose", POSE, START + slow, {"position": place})]  # fmt: skip
 
 
-def write_mcap(path: Path, gap: tuple[int, int] = (0, 0)) -> Path:
-    return mcap_of(path, planted(gap))
-
-
-def write_bag(path: Path) -> Path:
-    """The same, in a ROS 1 bag (.bag) or a ROS 2 bag (a folder)."""
-    return bag_of(path, planted())
-
-
 def write_robomimic(path: Path, demos: int = 2) -> Path:
     """Demonstrations as robomimic lays them out, 20 Hz, images among them."""
     steps = np.arange(50.0)

@@ -69,8 +69,7 @@ EDITS: dict[str, Edit] = {
     "stops_in_carry": lambda t, b: (join(t, (-END, (b[5] + b[6]) / 2)), 7),
     "stops_in_first_pickup": lambda t, b: (join(t, (-END, b[0] + 0.3)), 2),
     # Block 2 is moved before block 1.
-    "swapped": lambda t, b: (join(t, ((b[3] + b[4]) / 2, END), (-END, (b[3] + b[4]) / 2)), 1),
-}  # fmt: skip
+    "swapped": lambda t, b: (join(t, ((b[3] + b[4]) / 2, END), (-END, (b[3] + b[4]) / 2)), 1)}  # fmt: skip
 
 
 def _concatenate(one: Trial, first: tuple[float, float], other: Trial, second: tuple[float, float]) -> Trial:

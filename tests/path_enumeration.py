@@ -39,6 +39,5 @@ def brute(ll, bands, **ends):
     moves = [
         np.array([[p[(paths[:, t] == k) & (paths[:, t + 1] == k + d)].sum() for k in range(ll.shape[1] - d)]
                   for t in range(len(ll) - 1)]).reshape(len(ll) - 1, max(ll.shape[1] - d, 0))
-        for d in range(1, len(bands))
-    ]  # fmt: skip
+        for d in range(1, len(bands))]  # fmt: skip
     return paths, weights, log_evidence, smoothed, moves

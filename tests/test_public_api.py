@@ -129,8 +129,6 @@ def test_a_notebook_shows_every_result_once_and_every_plot():
 
 
 def test_results_read_like_the_terminals_table_and_fill_no_screen(found, monkeypatch):
-    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
-    assert "block1" in f"{found}" and "pickup block1" in repr(found.segmentations)
     seen = {}
     inside(found, seen)
     assert len(seen) > 50
@@ -142,6 +140,8 @@ def test_results_read_like_the_terminals_table_and_fill_no_screen(found, monkeyp
     assert "pickup block1" in repr(segmentation) and "hold-on-ground" in segmentation._repr_html_()
     aligned = found.aligned
     assert "trial_02.csv" in repr(aligned) and len(aligned.to_json()["trials"]) == 2
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)  # though rich would show them itself
+    assert "block1" in f"{found}" and "pickup block1" in repr(found.segmentations)
 
 
 def inside(value, seen):
@@ -156,7 +156,7 @@ def inside(value, seen):
             inside(each, seen)
 
 
-def test_a_simulated_trial_shows_its_truth(found, tmp_path):
+def test_learned_models_and_simulated_trials_show_what_they_hold(found, tmp_path):
     made = simgap.simulate(STACK / "task.toml", STACK / "rig.toml", seed=3)[0]
     text = repr(made)
     assert "pickup block1" in text and "0.343 N" in text and "1.59 cm" in text
@@ -165,9 +165,6 @@ def test_a_simulated_trial_shows_its_truth(found, tmp_path):
     assert made.to_json()["seed"] == made.seed
     made.plot(tmp_path / "truth.png")
     assert (tmp_path / "truth.png").stat().st_size > 10_000
-
-
-def test_a_learned_model_says_how_long_its_states_last():
     t = np.arange(0.0, 6.0, 0.02)
     noise = np.random.default_rng(0).normal(0.0, 0.05, (4, t.size))
     trials = [{"t": t, "force": np.where(t < 2.0 + 0.3 * k, 0.0, 3.0) + noise[k]} for k in range(4)]
@@ -177,16 +174,13 @@ def test_a_learned_model_says_how_long_its_states_last():
     assert "<td>press</td>" in model._repr_html_()
 
 
-def test_a_wrong_name_names_the_nearest(found):
+def test_plots_return_axes_and_wrong_names_name_the_nearest(found, tmp_path):
     with pytest.raises(KeyError, match=r"blok1.*block1"):
         found.of("blok1", "weight")
     with pytest.raises(KeyError, match=r"wieght.*weight"):
         found.of("block1", "wieght")
     with pytest.raises(KeyError, match=r"did you mean weight"):
         found.of("block1", "mass")
-
-
-def test_plots_return_axes_and_save_where_asked(found, tmp_path):
     assert len(found.segmentations[0].plot()) == 7 and found.plot_estimates() is not None
     assert len(found.plot_check()) == 2
     found.plot_posterior(str(tmp_path / "corner.png"))

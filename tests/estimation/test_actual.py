@@ -41,8 +41,7 @@ def test_a_file_gives_values_with_deviations_and_a_missing_one_is_named(tmp_path
                                 "(did you mean block1?)"),
     ({"block1": {"wieght": {}}}, "key block1.wieght: unknown property; expected one of friction, height, "
                                  "weight, width (did you mean weight?)"),
-    ({"block1": 3}, "key block1: found 3; expected tables [block1.PROPERTY]"),
-])  # fmt: skip
+    ({"block1": 3}, "key block1: found 3; expected tables [block1.PROPERTY]")])  # fmt: skip
 def test_refused_entries_and_tables(table, message):
     refused(re.escape(message), parse_actual, table, ["block1", "block2"])
 

@@ -56,16 +56,13 @@ def test_late_forces_and_single_samples_make_no_softer_pad():
     assert abs(found.weights @ reading) < 3 * np.sqrt(found.variance)
 
 
-def test_variance_is_that_of_repeated_noise():
+def test_noise_has_the_variance_that_is_stated_and_too_few_samples_tell_nothing():
     t, recorded, _ = grip()
     readings = [grip(noise=3e-5, seed=k)[2] for k in range(200)]
     slopes = [slope(t, reading, recorded, held(recorded), 1e-5, (0.0, 3e-5)) for reading in readings]
     values = [s.weights @ reading for s, reading in zip(slopes, readings, strict=True)]
     stated = np.sqrt(np.mean([s.variance for s in slopes]))
     assert np.std(values) == pytest.approx(stated, rel=0.35)
-
-
-def test_too_few_samples_of_a_grip_or_before_a_touch_tell_nothing():
     t, recorded, reading = grip()
     assert slope(t, reading, recorded, [np.arange(t.size) < 5], 1e-5) is None
     assert slope(t, reading, 0 * recorded, held(recorded + 1), 1e-5) is None

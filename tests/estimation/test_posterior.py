@@ -272,7 +272,7 @@ def test_draws_that_only_the_prior_decides_do_not_pass_as_converged():
     assert never.converged and (never.flat[:, 1:] > 0).all()
 
 
-def test_the_same_seed_draws_the_same_and_resampling_keeps_the_weights(post, draws):
+def test_the_proposal_is_a_density_and_the_same_seed_draws_the_same(post, draws, mode):
     weight = np.random.default_rng(0).dirichlet(np.ones(50))
     big = np.concatenate([np.repeat(weight / 200, 200)])
     index = sampler._resampled(big, np.random.RandomState(0))
@@ -281,10 +281,6 @@ def test_the_same_seed_draws_the_same_and_resampling_keeps_the_weights(post, dra
     again, other = sample(post, seed=1), sample(post, seed=2)
     np.testing.assert_array_equal(again.chain, draws.chain)
     assert not np.array_equal(other.chain[:, :10], draws.chain[:, :10])
-
-
-def test_density_of_the_proposal_integrates_to_one(post, mode):
-    """The mean of p / q over q's draws, p a Gaussian narrower than q, is 1."""
     found = proposal(post, mode)
     draws = found.draw(40_000, np.random.RandomState(1))
     chol = np.linalg.cholesky(0.3 * mode.covariance)

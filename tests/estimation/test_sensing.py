@@ -91,8 +91,7 @@ ALTERED = {
     "every other row": (lambda c: {n: np.where(PLACE % 2, c[n], np.nan) for n in NAMES},
                          "every channel lacks 50% of its readings"),
     "holes": (lacking(len(NAMES)), "every row without some reading"),
-    "clock": (later(0.5, 1.0), "t jumps by 1.05 s at 4.95 s"),
-}  # fmt: skip
+    "clock": (later(0.5, 1.0), "t jumps by 1.05 s at 4.95 s")}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow)
@@ -127,6 +126,7 @@ def test_coarse_forces_and_hands_that_stand_closer_say_no_more_than_they_can():
     assert found.of("block1", "width").mean() == pytest.approx(TRUTH["block1"]["width"] - 0.01, abs=1e-4)
     assert any("bases that stand closer than it says would not show" in note for note in found.notes)
     hand(wider=-0.04)(rig)  # a width below nothing is none, and the weights stay
+    found = identify(TABLE, FOLDER / "task.toml", rig)
     assert "comes out at -0.0312 m" in found.reasons["block1.width"]
     assert found.of("block1", "weight").mean() == pytest.approx(0.578, rel=0.02)
 

@@ -200,7 +200,7 @@ def test_a_world_is_what_its_rig_and_label_say(tmp_path: Path, monkeypatch: pyte
         np.testing.assert_allclose(np.diff(t), 1 / world.rate, atol=1.1e-5)
 
 
-def test_a_finger_may_close_first_and_the_truth_is_of_the_grip():
+def test_a_finger_may_close_first_but_meets_no_other_block():
     together, apart = (perform(plan(TASK, BLOCKS, HEALTHY, Style(stagger=(s, s)), np.random.default_rng(4)),
                                BLOCKS, HEALTHY) for s in (0.0, 0.08))  # fmt: skip
     for motion in (together, apart):
@@ -209,6 +209,11 @@ def test_a_finger_may_close_first_and_the_truth_is_of_the_grip():
         assert both[touch + 1] and not both[: touch - 1].any()
     pushed = lambda m: abs(m.centres[np.searchsorted(m.t, m.boundaries[0]), 0, 0] - m.centres[0, 0, 0])  # noqa: E731
     assert pushed(together) < 3e-4 < 8e-4 < pushed(apart)
+    t, touched = np.arange(6.0), np.zeros((6, 2), bool)
+    touched[[1, 2], [0, 0]] = touched[[4, 5], [1, 0]] = True
+    _check_touches(t, touched, (2.5, 5.0), [0, 1])
+    with pytest.raises(ValueError, match="another block"):
+        _check_touches(t, touched, (2.5, 4.5), [0, 1])
 
 
 def test_a_seal_is_kept_and_a_changed_label_is_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -229,11 +234,3 @@ def test_a_seal_is_kept_and_a_changed_label_is_caught(tmp_path: Path, monkeypatc
     file.write_text(json.dumps(labels))
     with pytest.raises(BrokenSeal, match=found):
         unseal(tmp_path)
-
-
-def test_a_finger_that_meets_another_block_is_no_trial():
-    t, touched = np.arange(6.0), np.zeros((6, 2), bool)
-    touched[[1, 2], [0, 0]] = touched[[4, 5], [1, 0]] = True
-    _check_touches(t, touched, (2.5, 5.0), [0, 1])
-    with pytest.raises(ValueError, match="another block"):
-        _check_touches(t, touched, (2.5, 4.5), [0, 1])

@@ -19,7 +19,7 @@ FOUR = [f"xl330_{n}" for n in ("kp100_sin_sin", "kp200_up_and_down", "kp400_lift
 NOT_THERE = ("backlash", "delay", "spring", "stribeck", "sag", "mass", "length")
 
 
-def test_snap_trials_are_read_and_cropped(shared):
+def test_snap_trials_are_read_and_cropped_or_refused(shared, tmp_path):
     trials = hiro_snap.read_kind(shared / "real/hiro_snap", "real_guarded")
     assert len(trials) == 7
     trial, labels = trials[0]
@@ -27,9 +27,6 @@ def test_snap_trials_are_read_and_cropped(shared):
     assert set(hiro_snap.WRENCH_AND_POSE) <= set(trial.channels)
     np.testing.assert_allclose(labels, [7.075, 15.385, 16.325])
     assert hiro_snap.cropped(trial, 2.0).t[0] == pytest.approx(2.0, abs=0.006)
-
-
-def test_malformed_snap_trials_are_refused(tmp_path):
     refused(r"R_Torques.dat: cannot be read", hiro_snap.read_trial, tmp_path)
     for name in ("R_Torques.dat", "R_CartPos.dat", "R_State.dat"):
         (tmp_path / name).write_text("0 1 2\n1 2 3\n")

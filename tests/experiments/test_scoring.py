@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from experiments import scoring
 from experiments.blind_check.judge import judge_case
@@ -19,7 +20,6 @@ from experiments.sbc import summary as rank_summary
 from experiments.score_recordings import METHODS, score_case, summarise
 from experiments.worlds import BIAS, WORLDS, _coloured, _stated, scene, task_of
 from hmmseg.contact.decompose import decompose, subtasks
-from hmmseg.errors import InputError
 from hmmseg.io.task import BlockTask, Move
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Segmentation, Span
@@ -75,8 +75,7 @@ def test_the_rules_on_the_paper_s_blocks_and_a_folder_without_cases(tmp_path):
     json.dumps(scores["qualitative"], allow_nan=False)
     ordered, plain = (summarise([scores[name]])["boundaries"] for name in scores)
     assert ordered["median"] < 0.025 and ordered["percentile_95"] < plain["percentile_95"]
-    with pytest.raises(InputError, match="holds no case"):
-        list_cases(tmp_path)
+    refused("holds no case", list_cases, tmp_path)
 
 
 def entry(case: str, tier: str, effects: dict, size: float = 0.5, measured: bool = True) -> dict:
@@ -126,8 +125,7 @@ def test_the_scorer_counts_hand_made_results():
                    said("named", ["fingertip_compliance"])),
         judge_case(entry("l", "pair", both), said("named", ["force_bias", "force_lag"])),
         judge_case(wide, said("named", ["force_bias"])),
-        judge_case(entry("n", "slight", bias), said("none", [])),
-    ]  # fmt: skip
+        judge_case(entry("n", "slight", bias), said("none", []))]  # fmt: skip
     found = figures(rows)
     table = found["table"]
     assert table["false_alarms"]["value"] == 0.5 and table["slight_none"]["value"] == 1.0
@@ -146,7 +144,7 @@ def test_the_scorer_counts_hand_made_results():
     assert low == pytest.approx(0.0126, abs=1e-3) and high == pytest.approx(0.9874, abs=1e-3)
 
 
-def test_a_recording_that_is_refused_counts_and_is_wrong():
+def test_refused_recordings_count_as_wrong_and_calibration_is_right_where_odds_come_true():
     refused = {"error": "does not fit its task", "seconds": 1.0}
     one, two = {"force_bias": {"fy1": 0.1}}, {"force_bias": {}, "force_lag": {}}
     tiers = (("healthy", {}), ("single", one), ("pair", two), ("outside", {"mains_hum": {}}),
@@ -155,9 +153,6 @@ def test_a_recording_that_is_refused_counts_and_is_wrong():
     assert table["false_alarms"]["value"] == 1.0 and table["errors"]["value"] == 1.0
     for name in ("named_right", "set_right", "outside_right", "withheld_right", "pair_both"):
         assert table[name]["count"] == 1 and table[name]["hits"] == 0
-
-
-def test_calibration_is_right_where_probabilities_come_true():
     rng = np.random.default_rng(1)
     p = rng.random((200, 20))
     honest = calibration([[(v, rng.random() < v) for v in row] for row in p])
@@ -234,8 +229,7 @@ def test_drawn_data_are_of_the_design_they_are_drawn_for():
     ("pair", {"verdict": "set", "causes": ["table_tilt"]}, "wrong name"),
     ("pair", {"verdict": "unknown", "causes": []}, "unknown"),
     ("outside", {"verdict": "unknown", "causes": []}, "unknown"),
-    ("outside", {"verdict": "named", "causes": ["table_tilt"]}, "wrong name"),
-])  # fmt: skip
+    ("outside", {"verdict": "named", "causes": ["table_tilt"]}, "wrong name")])  # fmt: skip
 def test_outcomes(tier, found, expected):
     effects = ["force_lag", "grip_slip"] if tier == "pair" else ["force_lag"]
     assert outcome({"tier": tier, "effects": effects}, found) == expected

@@ -1,5 +1,6 @@
-"""Constants, results and tables say where they come from; hands of the bank and summaries of estimates."""
+"""What is published stays as pinned and says where it comes from: results, constants and tables."""
 
+import copy
 import json
 import re
 import subprocess
@@ -11,6 +12,7 @@ import pytest
 import experiments.constants as table
 from experiments.blind_check.tables import fresh
 from experiments.calibration import Estimates, summarise_estimates
+from experiments.golden import KINDS, differences, folders, read, rounded
 from experiments.saving import commit_of, save
 from experiments.worlds import Deviations, deviated, scene, simulated_cases
 from experiments.write_tables import TABLES, fill
@@ -19,13 +21,18 @@ from hmmseg.hand.signals import task_space
 ROOT = Path(__file__).parents[2]
 
 
-def test_fill_replaces_what_stands_between_the_markers():
+def test_tables_are_filled_between_markers_and_no_spent_blind_set_is_a_result(monkeypatch):
     text = "a\n<!-- x -->\nold\n<!-- /x -->\nb\n<!-- y -->\n<!-- /y -->\n"
     once = fill(text, "x", "| new \\1 |")
     assert once == "a\n<!-- x -->\n\n| new \\1 |\n\n<!-- /x -->\nb\n<!-- y -->\n<!-- /y -->\n"
     assert fill(once, "x", "| new \\1 |") == once
     with pytest.raises(ValueError, match="no markers <!-- z -->"):
         fill(text, "z", "table")
+    seals = {"blind_check": {"seal": {"sha256": "a"}}, "blind_sets": {"sets": [{"seal": "a"}]}}
+    monkeypatch.setattr("experiments.blind_check.tables.load", seals.get)
+    assert fresh() is None
+    seals["blind_sets"] = {"sets": [{"seal": "b"}]}
+    assert fresh() is seals["blind_check"]
 
 
 def test_every_table_has_what_writes_it_and_a_target():
@@ -92,14 +99,6 @@ def test_deviated_hands_are_read_by_rigs_that_know_their_links_gains_biases_and_
     np.testing.assert_allclose(before.x1 - after.x1, give, atol=1e-9)
 
 
-def test_a_spent_blind_set_is_no_result(monkeypatch):
-    seals = {"blind_check": {"seal": {"sha256": "a"}}, "blind_sets": {"sets": [{"seal": "a"}]}}
-    monkeypatch.setattr("experiments.blind_check.tables.load", seals.get)
-    assert fresh() is None
-    seals["blind_sets"] = {"sets": [{"seal": "b"}]}
-    assert fresh() is seals["blind_check"]
-
-
 def test_every_constant_has_a_kind_and_a_reason_as_its_comment_means_it(tmp_path, monkeypatch):
     assert [f"{c.file}: {c.name}" for c in table.every() if c.kind == "unstated" or not c.reason] == []
     monkeypatch.setattr(table, "ROOT", tmp_path)
@@ -117,7 +116,7 @@ def test_every_constant_has_a_kind_and_a_reason_as_its_comment_means_it(tmp_path
                      ("BARE", "3.0", "unstated", "")]  # fmt: skip
 
 
-def test_a_result_says_which_code_made_it_and_nan_is_refused(tmp_path):
+def test_results_say_which_code_made_them_and_nan_is_refused(tmp_path):
     save(tmp_path / "new" / "found.json", {"value": 1.5})
     found = json.loads((tmp_path / "new" / "found.json").read_text())
     assert found == {"value": 1.5, "made_by": commit_of()}
@@ -125,6 +124,11 @@ def test_a_result_says_which_code_made_it_and_nan_is_refused(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
         save(tmp_path / "found.json", {"value": float("nan")})
     assert not (tmp_path / "found.json").exists()
+    known = {"blind_seal.json"}  # a list of hashes, each with the commits that drew and diagnosed the set
+    for path in sorted((ROOT / "experiments" / "results").rglob("*.json")):
+        if path.name not in known:
+            found = json.loads(path.read_text(encoding="utf-8"))
+            assert {"made_by", "commits"} & found.keys(), path.name
 
 
 def test_changed_code_is_told(tmp_path):
@@ -145,9 +149,48 @@ def test_changed_code_is_told(tmp_path):
     assert commit_of(tmp_path) == clean + "+"
 
 
-def test_every_result_says_which_code_made_it():
-    known = {"blind_seal.json"}  # a list of hashes, each with the commits that drew and diagnosed the set
-    for path in sorted((ROOT / "experiments" / "results").rglob("*.json")):
-        if path.name not in known:
-            found = json.loads(path.read_text(encoding="utf-8"))
-            assert {"made_by", "commits"} & found.keys(), path.name
+FAST = "none_1"
+
+
+def same(kind: str, name: str) -> None:
+    assert list(differences(read(kind)[name], rounded(KINDS[kind][1](name)))) == []
+
+
+def test_what_is_pinned_stays_in_every_folder_but_for_a_share_of_its_sd():
+    same("identified", FAST)
+    for kind in ("identified", "diagnosed"):
+        assert sorted(read(kind)) == folders()
+    old = read("identified")["none_1"]
+    for name, (mean, sd) in old["properties"].items():
+        for shift, found in ((0.2, 0), (0.3, 1)):
+            new = copy.deepcopy(old)
+            new["properties"][name] = [mean + shift * sd, sd]
+            assert len(list(differences(old, new))) == found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in folders() if name != FAST])
+def test_boundaries_and_properties_of_the_other_folders(name: str):
+    same("identified", name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind, name", [(k, n) for k in ("diagnosed", "ensembles") for n in read(k)])
+def test_verdicts_shares_and_parameters_are_those_pinned(kind: str, name: str):
+    same(kind, name)
+
+
+@pytest.mark.parametrize("path, by", [
+    (("identified", "none_1", "boundaries", 0, 3, 0), 2e-3),
+    (("diagnosed", "force_bias_1", "shares", "force_bias"), 0.06),
+    (("diagnosed", "force_bias_1", "shrinkage"), -0.06)])  # fmt: skip
+def test_what_moves_by_more_than_it_may_is_seen(path: tuple, by: float):
+    old = read(path[0])[path[1]]
+    new = copy.deepcopy(old)
+    place = new
+    for key in path[2:-1]:
+        place = place[key]
+    place[path[-1]] += by
+    assert len(list(differences(old, new))) == 1
+    place[path[-1]] -= 0.9 * by
+    assert list(differences(old, new)) == [] and len(list(differences(old, new, exact=True))) == 1

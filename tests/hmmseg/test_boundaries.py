@@ -98,16 +98,13 @@ def test_last_and_first_of_two_against_monte_carlo():
         np.testing.assert_allclose(found, (1 - UNIFORM) * expected + UNIFORM / POINTS, atol=5e-3)
 
 
-def test_quantiles_and_moments_of_a_known_distribution():
+def test_moments_are_of_the_distribution_and_without_knowledge_of_the_interval():
     times = np.linspace(-5, 5, 4001)
     density = np.exp(-0.5 * times**2)
     posterior = BoundaryPosterior(1.0 + 0.1 * times, density / density.sum())
     assert posterior.mean == pytest.approx(1.0) and posterior.sd == pytest.approx(0.1, rel=1e-4)
     for q, z in ((0.05, -1.6449), (0.5, 0.0), (0.95, 1.6449)):
         assert posterior.quantile(q) == pytest.approx(1.0 + 0.1 * z, abs=1e-4)
-
-
-def test_where_nothing_more_is_known_a_boundary_is_anywhere_in_its_interval():
     t = np.array([0.0, 0.1, 0.2, 0.35, 0.4])
     posterior = evenly(t, np.array([0.0, 0.25, 0.75, 1e-9]))
     assert (np.diff(posterior.times) >= 0).all() and posterior.probabilities.sum() == pytest.approx(1.0)

@@ -94,7 +94,9 @@ def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
 def test_students_edges_are_exact_and_em_ends_at_the_maximum_of_the_evidence():
     z = np.array([-1e5, -60.0, -4.0, -0.3, 0.0, 0.3, 4.0, 60.0])
     np.testing.assert_allclose(log_student_below(z), stats.t.logcdf(z, TAIL), rtol=1e-12, atol=1e-15)
-    trials = recorded()
+    rng = np.random.default_rng(0)
+    sizes = ((3, 6), (4, 5), (6, 3), (2, 3))
+    trials = [np.r_[rng.normal(size=before), rng.normal(2.0, 1.0, size=after)] for before, after in sizes]
     fit = learn_level(trials, 0.7, max_iterations=500, tolerance=1e-10)
     assert fit.converged
     best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
@@ -311,13 +313,6 @@ def by_enumeration(trials, level):
     for x in trials:
         terms = [
             norm.logpdf(x[:cut]).sum() + norm.logpdf(x[cut:], level).sum() + (cut - 1) * np.log(STAY)
-            + np.log(1 - STAY) for cut in range(1, x.size)
-        ]  # fmt: skip
+            + np.log(1 - STAY) for cut in range(1, x.size)]  # fmt: skip
         total += np.logaddexp.reduce(terms)
     return total
-
-
-def recorded():
-    rng = np.random.default_rng(0)
-    return tuple(np.r_[rng.normal(size=before), rng.normal(2.0, 1.0, size=after)]
-                 for before, after in ((3, 6), (4, 5), (6, 3), (2, 3)))  # fmt: skip

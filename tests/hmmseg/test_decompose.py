@@ -35,8 +35,7 @@ def test_the_papers_states():
     assert [(s.name, s.object) for s in found] == [
         ("pregrasp", "block1"), ("pickup", "block1"), ("carry", "block1"), ("place", "block1"),
         ("release", "block1"), ("pickup", "block2"), ("carry", "block2"), ("place", "block2"),
-        ("release", "block2"),
-    ]  # fmt: skip
+        ("release", "block2")]  # fmt: skip
     number = {"free-motion": 1, "hold-above-ground": 2, "hold-on-ground": 3}
     assert [number[s.state] for s in found] == [1, 3, 2, 3, 1, 3, 2, 3, 1]
     assert [s.support for s in found] == [None, "block2", None, GROUND, None, GROUND, None, "block1", None]
@@ -58,8 +57,7 @@ def test_physics_and_the_papers_table_1_name_what_each_subtask_tells():
     assert ways(found, "block1", "friction") == [(1,), (2,), (3,)]
     assert {name: entry.kind for name, entry in found.properties["block1"].items()} == {
         "weight": "value", "width": "value", "height": "value", "friction": "bound",
-        "friction_on_block2": "bound", "friction_on_ground": "bound",
-    }  # fmt: skip
+        "friction_on_block2": "bound", "friction_on_ground": "bound"}  # fmt: skip
 
 
 def test_tower_heights_take_several_moves_and_some_are_known_only_together():
@@ -127,15 +125,10 @@ def block_tasks(draw):
     return initial, moves
 
 
-def built(arguments) -> BlockTask:
-    initial, moves = arguments
-    return BlockTask(initial, tuple(Move(*move) for move in moves))
-
-
 @settings(max_examples=60, deadline=None)
 @given(block_tasks())
 def test_heights_agree_with_stacking_and_rank_and_every_property_has_evidence_or_a_reason(arguments):
-    task = built(arguments)
+    task = BlockTask(arguments[0], tuple(Move(*move) for move in arguments[1]))
     heights = dict(zip(task.objects, np.sqrt([2.0, 3.0, 5.0, 7.0]), strict=False))
     support = dict(task.initial)
 

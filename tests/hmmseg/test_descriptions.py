@@ -20,8 +20,7 @@ GRIPPERS = [
     ({"sensor_axes": ["x", "y", "-z"]}, ".*gripper.sensor_axes: x, y, -z are no right-handed axes"),
     ({"position": {"x": "a", "y": "b"}}, ".*position has no column for z, the axis that is up"),
     ({"force_per_ampere": 3.0}, ".*force_per_ampere without motor_current"),
-    ({"grip_force": 1e308}, "key gripper.grip_force"),
-]  # fmt: skip
+    ({"grip_force": 1e308}, "key gripper.grip_force")]  # fmt: skip
 
 
 def test_uncertainty_gripper_and_tolerance_are_read_and_what_is_left_out_has_its_default():
@@ -77,14 +76,12 @@ REFUSED = [
     ({"columns": {"t": {"unit": "mm"}}}, "rig: key columns: t is a time, but its unit mm is one of length"),
     ({"columns": {"fx1": {"unit": "deg"}}},
      "rig: key columns: fx1 is a force, but its unit deg is one of angle"),
-    ({"gripper": {}}, r"rig: a hand has \[fingers\] or is a \[gripper\], not both"),
-]  # fmt: skip
+    ({"gripper": {}}, r"rig: a hand has \[fingers\] or is a \[gripper\], not both")]  # fmt: skip
 
 
 @pytest.mark.parametrize(("table", "message"), [
     *(({**HAND, **table}, message) for table, message in REFUSED),
-    *(({"gripper": table}, f"rig: {message}") for table, message in GRIPPERS),
-])  # fmt: skip
+    *(({"gripper": table}, f"rig: {message}") for table, message in GRIPPERS)])  # fmt: skip
 def test_refused_with_its_message(table, message):
     refused(f"^{message}", parse_rig, table)
 

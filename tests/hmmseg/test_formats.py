@@ -17,14 +17,14 @@ from file_writers import (
     SLOW,
     START,
     Topic,
+    bag_of,
     force,
     height,
     joint,
     mcap_of,
+    planted,
     robomimic_of,
-    write_bag,
     write_lerobot,
-    write_mcap,
     write_robomimic,  # fmt: skip
 )
 from mcap.reader import make_reader
@@ -44,12 +44,11 @@ from hmmseg_cli.main import main
 TOPICS = parse_rig({"topics": {
     "push": {"from": "/wrench.wrench.force.x", "sign": -1},
     "angle": {"from": "/joints.position.b", "unit": "rad"},
-    "height": "/pose.pose.position.z",
-}})  # fmt: skip
+    "height": "/pose.pose.position.z"}})  # fmt: skip
 LOGGED = SequenceTask(("a", "b"), channels=("push", "angle", "height"))
-LOGS = {"mcap": lambda folder: write_mcap(folder / "log.mcap"),
-        "ROS 1 bag": lambda folder: write_bag(folder / "log.bag"),
-        "ROS 2 bag": lambda folder: write_bag(folder / "log")}  # fmt: skip
+LOGS = {"mcap": lambda folder: mcap_of(folder / "log.mcap", planted()),
+        "ROS 1 bag": lambda folder: bag_of(folder / "log.bag", planted()),
+        "ROS 2 bag": lambda folder: bag_of(folder / "log", planted())}  # fmt: skip
 NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
 HAND = ["--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"), "--method", "qualitative"]
 
@@ -61,8 +60,8 @@ def test_logs_are_joined_on_the_fastest_wanted_clock(tmp_path, kind):
     assert trial.origin == START + FAST[0]  # stamps of the headers, not times of logging
     np.testing.assert_allclose(trial.channels["push"], -force(FAST), rtol=1e-12)
     inside = SLOW[-1] >= FAST
-    for name, planted in (("angle", joint), ("height", height)):
-        np.testing.assert_allclose(trial.channels[name][inside], planted(FAST[inside]), rtol=1e-9)
+    for name, course in (("angle", joint), ("height", height)):
+        np.testing.assert_allclose(trial.channels[name][inside], course(FAST[inside]), rtol=1e-9)
         assert np.isnan(trial.channels[name][~inside]).all()
         np.testing.assert_array_equal(trial.interpolated[name], inside & ~np.isin(FAST, SLOW))
     assert "push" not in trial.interpolated
@@ -71,10 +70,11 @@ def test_logs_are_joined_on_the_fastest_wanted_clock(tmp_path, kind):
 def test_logs_without_stamps_with_gaps_and_of_two_publishers_keep_their_times(tmp_path):
     rig = parse_rig({"topics": {"f": "/wrench.wrench.force.x", "w": "/opening.data",
                                 "z": "/pose.pose.position.z"}})  # fmt: skip
-    trial = read_trial(write_mcap(tmp_path / "a.mcap"), rig, SequenceTask(("a",), channels=("f", "w", "z")))
+    trial = read_trial(mcap_of(tmp_path / "a.mcap", planted()), rig,
+                       SequenceTask(("a",), channels=("f", "w", "z")))  # fmt: skip
     assert trial.origin == START + 300_000
     np.testing.assert_allclose(trial.channels["w"], 0.06)
-    path = write_mcap(tmp_path / "a.mcap", gap=(500_000_000, 900_000_000))
+    path = mcap_of(tmp_path / "a.mcap", planted((500_000_000, 900_000_000)))
     trial = read_trial(path, TOPICS, LOGGED)
     missing = np.isnan(trial.channels["height"])
     low, high = SLOW[SLOW < 500_000_000][-1], SLOW[SLOW >= 900_000_000][0]
@@ -112,7 +112,7 @@ def test_two_clocks_are_noticed(tmp_path, how):
 
 
 def test_what_a_bag_lacks_is_listed_and_the_rest_is_read(tmp_path):
-    folder = write_bag(tmp_path / "log")
+    folder = bag_of(tmp_path / "log", planted())
     with sqlite3.connect(next(folder.glob("*.db3"))) as base:
         base.execute("UPDATE topics SET type = 'lab_msgs/msg/Motor' WHERE name = '/opening'")
     assert (
@@ -129,7 +129,7 @@ def test_what_a_bag_lacks_is_listed_and_the_rest_is_read(tmp_path):
     assert "has no metadata.yaml: the recording was not finished" in trial.warnings[0]
     rig = parse_rig({"topics": {"f": "/wrench.wrench.force.xx"}})
     refused(r"column /wrench.wrench.force.xx: missing, but the rig maps f to it", read_trial,
-            write_mcap(tmp_path / "a.mcap"), rig, SequenceTask(("a",), channels=("f",)))  # fmt: skip
+            mcap_of(tmp_path / "a.mcap", planted()), rig, SequenceTask(("a",), channels=("f",)))  # fmt: skip
 
 
 def test_columns_of_other_lengths_are_read_apart(tmp_path):
@@ -298,7 +298,7 @@ def test_segment_writes_columns(tmp_path, kind):
 
 
 def test_a_topic_of_a_new_mcap(tmp_path):
-    source = write_mcap(tmp_path / "a.mcap")
+    source = mcap_of(tmp_path / "a.mcap", planted())
     rig = parse_rig({"topics": {"f": "/wrench.wrench.force.x"}})
     trial = read_trial(source, rig, SequenceTask(("a",), channels=("f",)))
     write_topic(tmp_path / "b.mcap", source, trial, SPANS)
@@ -319,8 +319,7 @@ def test_a_topic_of_a_new_mcap(tmp_path):
     ("out.csv", 2, "--write out.csv: is one file for 2 recordings; expected a folder"),
     (".", 1, "--write .: would write over its own recording"),
     ("file/out.csv", 1, "--write file: .*file is not a folder"),
-    ("file", 1, "--write file: .*file is not a folder; expected a folder"),
-])  # fmt: skip
+    ("file", 1, "--write file: .*file is not a folder; expected a folder")])  # fmt: skip
 def test_destinations_refused_before_the_work(tmp_path, monkeypatch, capsys, write, trials, line):
     monkeypatch.chdir(tmp_path)
     for k in range(1, trials + 1):

@@ -36,11 +36,13 @@ def squeeze(step=0.02, compliance=2.5e-4):
     return Stretch(t, load, step, clock, place, 2e-5)
 
 
-def test_the_slope_of_a_squeeze_is_the_compliance():
+def test_slopes_and_toes_of_squeezes_are_found_where_there_are_any():
     load, value = reading(squeeze())
     slope, information = fit_slope(load, value, 2e-5)
     assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5) and np.std(value + slope * load) < 4e-5
     assert fit_slope(load[:3], value[:3], 2e-5) == fit_slope(0 * load, value, 2e-5) == (0.0, 0.0)
+    assert find_toe(releases(Toe(-4e-4, 0.8))) is NONE
+    assert find_toe([]) is NONE and find_toe([(np.ones(3), np.ones(3), SD)]) is NONE
 
 
 def test_loads_that_ring_while_nothing_moves_say_little_of_the_pads():
@@ -66,10 +68,12 @@ def test_releases_of_grips_that_ring_are_not_early():
     assert np.abs(ends - judged.boundaries)[3::4].max() < 0.02  # 26 and 37 ms with pads taken to be rigid
 
 
-def test_holds_in_which_misread_forces_pull_say_nothing_of_a_delay():
+def test_soft_pads_and_holds_in_which_misread_forces_pull_are_no_delay():
     t = np.arange(0.0, 0.8, 0.02)
     pulls = Squeeze(t, np.full(t.size, 0.02), np.zeros(t.size), -1.0 - 0.1 * t, 2e-5, 0.01)
     assert lateness([pulls], PRIOR) == lateness([], PRIOR) == Lateness()
+    own = [whole_grip(seed=i, compliance=1.6 * COMPLIANCE) for i in range(4)]
+    assert not lateness(own, PRIOR).late
 
 
 @pytest.mark.parametrize("shift", [-0.003, 0.003])
@@ -88,18 +92,15 @@ def world(**effects):
     return found, np.array([s.start for s in found.spans[1:]]) - judged.boundaries
 
 
-def test_recorded_lag_is_found_and_said():
+def test_recorded_lag_is_found_and_said_and_healthy_forces_are_on_time():
     found, residual = world(force_lag={"delay": 0.12})
     assert "come late" in found.remarks[0] or "filtered" in found.remarks[0]
     assert np.median(np.abs(residual)) < 0.012
-
-
-def test_healthy_forces_are_neither_late_nor_filtered():
     found, residual = world()
     assert found.remarks == () and np.median(np.abs(residual)) < 0.004
 
 
-def test_reading_again_undoes_what_was_found():
+def test_reading_again_undoes_what_was_found_and_smears_no_jump():
     t = np.arange(0, 1, 0.01)
     ramp, zero = np.clip(t - 0.3, 0, 0.4), np.zeros(t.size)
     late = np.interp(t - 0.05, t, ramp)
@@ -110,9 +111,6 @@ def test_reading_again_undoes_what_was_found():
     again = read_again(signals, Sensing(pad, pad, 0.05, 0.001, late=True))
     np.testing.assert_allclose(again.fx1[:94], ramp[:94], atol=1e-12)
     np.testing.assert_allclose(again.x1, late)
-
-
-def test_a_jump_is_not_smeared_over_the_samples_before_it():
     t = np.arange(20) * 0.05
     jump = np.where(t < 0.5, 0.0, 1.0)
     for late in (0.01, 0.02, 0.03, 0.04):
@@ -167,11 +165,6 @@ def test_a_delay_is_found(delay, step):
 def test_a_filter_is_found_and_told_from_a_delay(constant):
     found = lateness([whole_grip(constant=constant, seed=i) for i in range(4)], PRIOR)
     assert found.late and found.filter and found.delay == pytest.approx(constant, rel=0.2)
-
-
-def test_pads_softer_than_stated_are_no_delay():
-    own = [whole_grip(seed=i, compliance=1.6 * COMPLIANCE) for i in range(4)]
-    assert not lateness(own, PRIOR).late
 
 
 @pytest.mark.parametrize("prior", [PRIOR, (0.0, 2e-4)])
@@ -251,8 +244,3 @@ def test_a_planted_toe_is_found(planted):
 @pytest.mark.parametrize("compliances", [(1e-4,), (1e-4, 2e-4)])
 def test_straight_contacts_have_none_however_they_differ(compliances):
     assert all(find_toe(releases(compliances=compliances, seed=seed)) is NONE for seed in range(10))
-
-
-def test_contacts_that_stiffen_the_other_way_and_too_few_samples_have_none():
-    assert find_toe(releases(Toe(-4e-4, 0.8))) is NONE
-    assert find_toe([]) is NONE and find_toe([(np.ones(3), np.ones(3), SD)]) is NONE

@@ -161,8 +161,7 @@ def test_the_same_answer_from_disk_as_from_memory(repeated, tmp_path, name, piec
     found = segment_long(LongRecording(path, rig, piece), task, rig)
     assert found.spans == whole.spans
     assert (found.repetitions, found.failures, found.log_evidence, found.rate) == (
-        whole.repetitions, whole.failures, whole.log_evidence, whole.rate
-    )  # fmt: skip
+        whole.repetitions, whole.failures, whole.log_evidence, whole.rate)  # fmt: skip
 
 
 def test_rows_are_those_of_the_file_and_a_fault_is_named_with_its_row(repeated, tmp_path):

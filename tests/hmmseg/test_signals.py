@@ -71,7 +71,7 @@ def cartesian(samples=12) -> pd.DataFrame:
                                                                     strict=True)))  # fmt: skip
 
 
-def test_noise_of_a_position_agrees_with_samples():
+def test_noise_of_positions_and_of_derived_velocities_agrees_with_samples():
     rng, n = np.random.default_rng(1), 20_000
     frame = pd.DataFrame({"t": np.arange(n) * 1e-3, **{name: 0.0 for name in JOINT_CHANNELS}})
     for name, angle in (("q11", -2.0), ("q12", -0.1), ("q21", -1.1), ("q22", -3.0)):
@@ -83,6 +83,14 @@ def test_noise_of_a_position_agrees_with_samples():
         rms = np.sqrt(both.var(axis=1).mean())  # `sd_*` is the fingers' root mean square
         assert getattr(signals, f"sd_{axis}").mean() == pytest.approx(rms, rel=0.03)
     assert signals.sd_force == 0.012
+    rng, n = np.random.default_rng(2), 20_000
+    frame = pd.DataFrame({"t": np.arange(n) * 0.01,
+                          **{name: 0.0 for name in CARTESIAN_CHANNELS if "v" not in name}})  # fmt: skip
+    for name in ("x1", "y1", "x2", "y2"):
+        frame[name] = rng.normal(scale=1e-4, size=n)
+    signals = task_space(read_trial(frame, CARTESIAN), CARTESIAN)
+    assert signals.sd_vx[5] == pytest.approx(signals.vx1.std(), rel=0.03)
+    assert signals.sd_vy[0] == pytest.approx(2 * signals.sd_vy[5])
 
 
 def test_cartesian_velocities_given_or_derived():
@@ -99,17 +107,6 @@ def test_cartesian_velocities_given_or_derived():
     np.testing.assert_allclose(np.delete(derived.vx1, 7)[1:-1], np.delete(t, 7)[1:-1] / 50, atol=1e-12)
     np.testing.assert_allclose(derived.vx2[1:-1], t[1:-1] / 50, atol=1e-12)
     np.testing.assert_array_equal(derived.vy1, frame["vy1"])
-
-
-def test_noise_of_a_derived_velocity_agrees_with_samples():
-    rng, n = np.random.default_rng(2), 20_000
-    frame = pd.DataFrame({"t": np.arange(n) * 0.01,
-                          **{name: 0.0 for name in CARTESIAN_CHANNELS if "v" not in name}})  # fmt: skip
-    for name in ("x1", "y1", "x2", "y2"):
-        frame[name] = rng.normal(scale=1e-4, size=n)
-    signals = task_space(read_trial(frame, CARTESIAN), CARTESIAN)
-    assert signals.sd_vx[5] == pytest.approx(signals.vx1.std(), rel=0.03)
-    assert signals.sd_vy[0] == pytest.approx(2 * signals.sd_vy[5])
 
 
 def test_task_space_of_a_grip():
@@ -133,12 +130,15 @@ def test_inverse_undoes_forward(number):
     np.testing.assert_allclose(forward(HAND[number], q), TIPS, atol=1e-14)
 
 
-def test_angles_of_a_known_pose():
+def test_angles_of_a_known_pose_and_a_tip_out_of_reach():
     # Both links at right angles: link 1 straight down, link 2 level, as drawn by hand.
     q = inverse(HAND[1], 1, np.array([0.05 + 0.10, 0.17 - 0.12]))
     np.testing.assert_allclose(q, [-np.pi / 2, 0.0], atol=1e-12)
     q = inverse(HAND[2], 2, np.array([0.21 - 0.12, 0.17 - 0.12]))
     np.testing.assert_allclose(q, [-np.pi / 2, -np.pi], atol=1e-12)
+    with pytest.raises(InputError, match=r"finger 1: the task needs a tip 0\.5\d+ m from its base"):
+        require_reach(HAND[1], 1, np.array([[0.6, 0.17]]))
+    require_reach(HAND[1], 1, TIPS)
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -151,12 +151,6 @@ def test_velocities_agree_with_differences_and_with_jax(number):
     np.testing.assert_allclose(tip_velocity(finger, q, rate), speed, atol=1e-13)
     _, by_jax = jax.jvp(lambda z: forward(finger, z), (jax.numpy.asarray(q),), (jax.numpy.asarray(rate),))
     np.testing.assert_allclose(by_jax, speed, atol=1e-13)
-
-
-def test_a_tip_out_of_reach_is_refused():
-    with pytest.raises(InputError, match=r"finger 1: the task needs a tip 0\.5\d+ m from its base"):
-        require_reach(HAND[1], 1, np.array([[0.6, 0.17]]))
-    require_reach(HAND[1], 1, TIPS)
 
 
 def _trial() -> tuple[Trial, Rig]:
@@ -187,15 +181,12 @@ def test_velocities_that_repeat_the_positions_are_replaced_by_central_difference
     assert error[0] < 0.6 * error[1]
 
 
-def test_velocities_of_their_own_stay():
+def test_velocities_of_their_own_stay_and_rates_beside_a_kink_are_of_their_own_side():
     trial, rig = _trial()
     signals = task_space(trial, rig)
     assert timely(signals, trial) is signals
     still = np.zeros(50)  # positions that never change prove nothing
     assert not late_differences(np.arange(50) * 0.05, still, still)
-
-
-def test_rates_beside_a_kink_are_those_of_their_own_side():
     t = np.arange(40) * 0.05
     kink = t[20]
     left, right = one_sided(t, np.where(t < kink, 0.3 * t + 0.1 * t**2, 0.3 * kink + 0.1 * kink**2))[0]
@@ -214,12 +205,19 @@ def made_signals(t, rng, sd=0.1):
     return Signals(t=t, **columns, **spread, sd_force=sd)
 
 
-def test_noise_is_found_beneath_a_smooth_signal():
+def test_noise_is_found_beneath_a_smooth_signal_and_of_means_and_distances():
     rng, t = np.random.default_rng(0), np.arange(2000) * 0.05
     noise = noise_sd(np.sin(t) + 0.01 * rng.normal(size=t.size))
     assert noise == pytest.approx(0.01, rel=0.1)
     stepped = np.sin(t) + 0.01 * rng.normal(size=t.size) + 5.0 * (t > 40) + 5.0 * (t > 70)
     assert noise_sd(stepped) == pytest.approx(0.01, rel=0.1)
+    rig = Rig(noise=Noise(position=3e-5, velocity=4e-3, force=0.01), fingertip=Fingertip())
+    t = np.arange(40) * 0.05
+    trial = Trial("made.csv", t, {name: np.sin(t) for name in CHANNELS})
+    f = features(task_space(trial, rig), rig)
+    np.testing.assert_allclose(f.sd_y, 3e-5 / np.sqrt(2))
+    np.testing.assert_allclose(f.sd_d, 3e-5 * np.sqrt(2))
+    np.testing.assert_allclose(f.sd_vx, 4e-3 / np.sqrt(2))
 
 
 def test_thinning_averages_groups_and_their_noise():
@@ -255,16 +253,6 @@ def test_means_over_time_skip_missing_values():
     assert np.isnan(acceleration(t[:2], velocity[:2])).all()
 
 
-def test_noise_of_means_and_distances():
-    rig = Rig(noise=Noise(position=3e-5, velocity=4e-3, force=0.01), fingertip=Fingertip())
-    t = np.arange(40) * 0.05
-    trial = Trial("made.csv", t, {name: np.sin(t) for name in CHANNELS})
-    f = features(task_space(trial, rig), rig)
-    np.testing.assert_allclose(f.sd_y, 3e-5 / np.sqrt(2))
-    np.testing.assert_allclose(f.sd_d, 3e-5 * np.sqrt(2))
-    np.testing.assert_allclose(f.sd_vx, 4e-3 / np.sqrt(2))
-
-
 @pytest.mark.parametrize("deriv", [0, 1, 2])
 @pytest.mark.parametrize(("size", "window"), [(40, 0.05), (200, 0.25), (7, 0.07), (9, 0.5)])
 def test_local_parabolas_are_those_of_savitzky_and_golay(size, window, deriv):
@@ -274,7 +262,7 @@ def test_local_parabolas_are_those_of_savitzky_and_golay(size, window, deriv):
     np.testing.assert_allclose(smooth(t, values, deriv, window), expected, atol=1e-12 * 100.0**deriv)
 
 
-def test_what_lags_behind_a_filter_is_what_the_filter_makes_of_every_step():
+def test_filters_and_distances_between_samples_are_those_of_every_step():
     rng = np.random.default_rng(1)
     values, kept = rng.normal(size=(2, 3, 50)), np.array([0.0, 0.3, 0.95])
     place, share = np.array([0, 0, 7, 20, 48]), rng.uniform(size=5)
@@ -282,9 +270,6 @@ def test_what_lags_behind_a_filter_is_what_the_filter_makes_of_every_step():
         every = lfilter([1 - k], [1, -k], values, zi=k * values[..., :1])[0]
         expected = (1 - share) * every[..., place] + share * every[..., place + 1]
         np.testing.assert_allclose(lagging(values, kept, place, share)[..., c], expected, rtol=1e-14)
-
-
-def test_distances_between_samples_are_hermite_pieces():
     rng = np.random.default_rng(2)
     t = np.cumsum(rng.uniform(0.01, 0.05, size=20))
     distance, rate = rng.normal(size=(2, 20))
@@ -293,11 +278,22 @@ def test_distances_between_samples_are_hermite_pieces():
     np.testing.assert_allclose(found, CubicHermiteSpline(t, distance, rate)(clock), atol=1e-12)
 
 
-def test_a_twentieth_of_wild_samples_hardly_moves_a_deviation():
+def test_robust_numbers_hardly_move_with_wild_samples_weights_and_gaps():
     residual = np.random.default_rng(0).normal(0.0, 2.0, 100_000)
     assert robust_sd(residual) == pytest.approx(2.0, rel=0.01)
     residual[::20] = 1e6
     assert robust_sd(residual) == pytest.approx(2.0, rel=0.08)
+    rng = np.random.default_rng(2)
+    values, times = rng.normal(size=31), rng.integers(1, 9, 31)
+    times[0] += 1 - times.sum() % 2  # an odd number of values has one in the middle
+    assert weighted_median(values, times.astype(float)) == np.median(np.repeat(values, times))
+    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0  # of what is there
+    values = np.array([0.0, np.nan, np.nan, 9.0])
+    np.testing.assert_allclose(bridged(values), [0, 3, 6, 9])
+    np.testing.assert_allclose(bridged(values, np.array([0.0, 1.0, 8.0, 9.0])), [0, 1, 8, 9])
+    assert bridged(np.ones(3)).tolist() == [1.0, 1.0, 1.0]
+    with pytest.raises(ValueError, match="empty"):
+        bridged(np.full(3, np.nan))
 
 
 @pytest.mark.parametrize("order", [1, 2, 4])
@@ -307,31 +303,11 @@ def test_white_noise_is_seen_on_a_bending_signal(order):
     assert white_sd(signal, order) == pytest.approx(0.1, rel=0.02)
 
 
-def test_a_weighted_median_is_that_of_repeated_values():
-    rng = np.random.default_rng(2)
-    values, times = rng.normal(size=31), rng.integers(1, 9, 31)
-    times[0] += 1 - times.sum() % 2  # an odd number of values has one in the middle
-    assert weighted_median(values, times.astype(float)) == np.median(np.repeat(values, times))
-    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0  # of what is there
-
-
-def test_gaps_are_bridged_in_time():
-    values = np.array([0.0, np.nan, np.nan, 9.0])
-    np.testing.assert_allclose(bridged(values), [0, 3, 6, 9])
-    np.testing.assert_allclose(bridged(values, np.array([0.0, 1.0, 8.0, 9.0])), [0, 1, 8, 9])
-    assert bridged(np.ones(3)).tolist() == [1.0, 1.0, 1.0]
-    with pytest.raises(ValueError, match="empty"):
-        bridged(np.full(3, np.nan))
-
-
-def test_equations_of_a_rolled_block():
+def test_a_recorded_roll_is_taken_out_by_the_equations_of_a_rolled_block():
     corners = np.array([[-0.03, 0.0], [0.03, 0.0]])
     x, y = turned(*corners.T, 0.02)
     assert y[1] - y[0] == pytest.approx(rolled_offset(0.06, 0.02), rel=1e-4)
     assert np.hypot(x, y) == pytest.approx([0.03, 0.03])
-
-
-def test_a_recorded_roll_is_taken_out():
     rolled, _, _ = rolling_trial(76200, 0.05)
     level, _, _ = rolling_trial(76200, 0.0)
     found = remove_roll(rolled)

@@ -63,7 +63,7 @@ def test_every_kind_of_file_or_table_holds_the_same_trial_and_nulls_are_missing(
     assert np.flatnonzero(np.isnan(read_trial(frame, parse_rig({})).channels["fx1"])).tolist() == [3]
 
 
-def test_csv_as_spreadsheets_write_it(tmp_path):
+def test_csv_as_spreadsheets_write_it_and_dates_that_become_seconds(tmp_path):
     frame = table()
     lines = frame.to_csv(index=True).splitlines()  # with a nameless column of row numbers
     text = "\r\n".join([lines[0].replace(",", " , "), *lines[1:5], "", *lines[5:]]) + "\r\n\r\n"
@@ -71,6 +71,14 @@ def test_csv_as_spreadsheets_write_it(tmp_path):
     assert_same(read_trial(tmp_path / "a.csv", JOINTED), frame)
     assert "t" not in read_trial(tmp_path / "a.csv", task=PLAIN).channels
     assert set(read_trial(tmp_path / "a.csv", task=PLAIN).channels) == set(JOINT_CHANNELS)
+    ours = scene(10)
+    stamps = np.datetime64("2026-11-23T15:00:00.5", "ns") + (ours["t"] * 1e9).astype("timedelta64[ns]")
+    for t in (stamps, np.array([f"{s}Z" for s in stamps], dtype=object),
+              pd.Series(stamps).dt.tz_localize("CET")):  # fmt: skip
+        trial = read_trial({**ours, "t": t}, parse_rig({}))
+        np.testing.assert_allclose(trial.t, ours["t"], atol=1e-12)
+        assert trial.origin is not None
+    assert read_trial({**ours, "t": stamps}, parse_rig({})).origin == stamps[0].astype(int)
 
 
 def test_missing_cells_uneven_times_integers_and_nullable_columns(tmp_path):
@@ -87,6 +95,7 @@ def test_missing_cells_uneven_times_integers_and_nullable_columns(tmp_path):
     assert_same(trial, frame)
     signals = task_space(trial, JOINTED)
     assert np.isnan(signals.fx[3]) and np.isnan(signals.x[5]) and np.isfinite(signals.fy[[3, 5]]).all()
+    frame = table()
     frame["fx1"] = pd.array([1, None] * 6, dtype="Int64")
     frame["fy1"] = 2
     trial = read_trial(frame, JOINTED)
@@ -164,8 +173,7 @@ REFUSED_CSV = [("", "column t: missing; expected a header row with a column t of
     (table().assign(fy2=[0.1] * 3 + [-1e300] + [0.1] * 8),
      r"DataFrame: row 4, column fy2: -1e\+300 is no reading of a hand's sensor"),
     (table().assign(t=[*np.arange(11) * 0.05, 1e200]),
-     r"DataFrame: .*column t: 1e\+200 is no time; expected a time in s"),
-])  # fmt: skip
+     r"DataFrame: .*column t: 1e\+200 is no time; expected a time in s")])  # fmt: skip
 def test_dataframe_refused_with_its_message(frame, message):
     refused(f"^{message}", read_trial, frame, JOINTED)
 
@@ -221,17 +229,6 @@ def test_mapping_is_undone_by_units_sign_and_offset_and_fits_the_file():
         read_trial(ours, parse_rig({"columns": {"xl": "x1"}}))
 
 
-def test_dates_become_seconds_since_the_first():
-    ours = scene(10)
-    stamps = np.datetime64("2026-11-23T15:00:00.5", "ns") + (ours["t"] * 1e9).astype("timedelta64[ns]")
-    for t in (stamps, np.array([f"{s}Z" for s in stamps], dtype=object),
-              pd.Series(stamps).dt.tz_localize("CET")):  # fmt: skip
-        trial = read_trial({**ours, "t": t}, parse_rig({}))
-        np.testing.assert_allclose(trial.t, ours["t"], atol=1e-12)
-        assert trial.origin is not None
-    assert read_trial({**ours, "t": stamps}, parse_rig({})).origin == stamps[0].astype(int)
-
-
 def test_units():
     assert si_factor("mm") == 1e-3 and known_unit("Milliseconds") == "ms" and known_unit("N m") == "Nm"
     assert known_unit("parsec") is None
@@ -244,8 +241,7 @@ def test_units():
 @pytest.mark.parametrize(
     ("name", "unit"),
     [("left_x_mm", "mm"), ("force [N]", "N"), ("t (ms)", "ms"), ("angle [°]", "deg"), ("time_ns", "ns"),
-     ("x1", None), ("speed_mm/s", "mm/s"), ("finger_left", None), ("state[3]", None)],
-)  # fmt: skip
+     ("x1", None), ("speed_mm/s", "mm/s"), ("finger_left", None), ("state[3]", None)])  # fmt: skip
 def test_unit_in_a_name(name, unit):
     assert unit_in_name(name) == unit
 
@@ -335,8 +331,7 @@ REFUSED = [
     (written() + '0.6,"1\n2",3\n', r"row 14: a quoted cell does not end; expected one line a row"),
     (written() + '0.6,1,"3\n0.7,1,2\n', r"row 14: a quoted cell does not end; expected one line a row"),
     (written().replace("0.05,", "2026-11-23,", 1), r"row 2, column t: 0.0 is not a date|is not a finite"),
-    (written("\t").replace("\t", ",", 3), r"row \d: has \d cells; expected \d as in the header"),
-]  # fmt: skip
+    (written("\t").replace("\t", ",", 3), r"row \d: has \d cells; expected \d as in the header")]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "line", "read"),

@@ -131,6 +131,7 @@ def test_nothing_is_looked_ahead_and_late_and_repeated_rows_lose_nothing(watched
     table[120:] = table[:80]
     assert follow(watcher, t[:120], table[:120]) == lines[:120]
     straight, _, final = watched
+    watcher, t, table = read()
     order = [*range(50), 52, 51, 50, 50, *range(53, 120), 122, 120, 121, *range(123, 200)]
     lines = follow(watcher, t[order], table[order])
     notes = [line["note"].split(":")[0] for line in lines if "note" in line]
@@ -193,6 +194,7 @@ def test_gaps_rows_beyond_the_lag_and_missing_channels_are_told_and_pass():
     lines = follow(watcher, t[keep], table[keep])
     assert [line["note"] for line in lines if "note" in line] == ["gap: 0.4 s since the row before"]
     assert "too late" in watcher.update(0.5, table[10] + 1e-3).note
+    watcher, t, table = read()
     table[10:14, 3] = np.nan
     table[60:63] = np.nan
     lines = follow(watcher, t, table)
@@ -227,6 +229,7 @@ def test_hypotheses_do_not_grow_with_time_and_a_clock_that_leaps_leaves_few():
             watcher.update(again * 2.0 + at_, row)
         sizes.append((len(watcher.filter.rows), watcher.filter._state.count))
     assert len({rows for rows, _ in sizes[1:]}) == 1 and max(count for _, count in sizes) < 100
+    watcher, t, table = read()
     for at, row in zip([*t[:60], 3.9e7, 3.9e7 + 0.05, *t[60:80], 1e12], table[:83], strict=True):
         watcher.update(float(at), row)
         state = watcher.filter._state

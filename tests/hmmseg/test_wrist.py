@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from estimation import identify
 from estimation.identification import identify_aligned
@@ -30,8 +31,7 @@ def performed():
 @pytest.mark.parametrize(
     "name",
     ["as it is", "reaction, untared", "all said", "turning, untared", "world's axes, drifting",
-     "poor sensors", "500 Hz"],
-)  # fmt: skip
+     "poor sensors", "500 Hz"])  # fmt: skip
 def test_blocks_and_boundaries_from_the_wrist_alone(performed, name):
     setup, said = SETUPS[name]
     rig = wrist_rig(setup, **said)
@@ -162,6 +162,7 @@ def test_missing_samples_and_places_that_never_change_are_bridged(performed):
     holed = read_trial(columns, wrist_rig(PLAIN))
     assert np.isnan(holed.channels["fy1"][200:203]).all()
     assert np.nanmax(np.abs(holed.channels["fy1"] - whole.channels["fy1"])) < 0.1
+    columns = wrist_recording(performed[0], PLAIN)
     usual = read_trial(columns, wrist_rig(PLAIN))
     still = read_trial(columns | {"px": np.full_like(columns["px"], 0.5)}, wrist_rig(PLAIN))
     np.testing.assert_allclose(still.channels["fy1"], usual.channels["fy1"], atol=0.05)
@@ -183,9 +184,7 @@ def test_what_cannot_be_is_told_in_one_line(performed, setup, said, change, line
     for name, factor in change.items():
         columns[name] = columns[name] * factor
     rig = wrist_rig(setup, **said)
-    with pytest.raises(InputError, match=line) as told:
-        read_trial(columns, rig)
-    assert "\n" not in str(told.value)
+    refused(line, read_trial, columns, rig)
 
 
 @pytest.mark.parametrize("step", [4e-4, 1e-3])

@@ -14,8 +14,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from refusals import refused
 
-from hmmseg.errors import InputError
 from hmmseg.example import example_folder
 from hmmseg_cli import batch
 from hmmseg_cli.batch import recordings_in, segment_apart
@@ -77,12 +77,21 @@ def test_a_cluster_finds_the_same(lab, one):
     assert segmented(lab, "--scheduler", "local", "--workers", "2") == one
 
 
-def test_what_is_wrong_with_one_recording_is_one_line(lab, capfd, tmp_path):
+def test_bad_recordings_folders_and_plain_sequences_are_told_in_a_line(lab, capfd, tmp_path):
     (tmp_path / "bad.csv").write_text("t,x1\n0,1\n")
     arguments = ["--task", "task.toml", "--rig", "rig.toml", "--json", f"{tmp_path}/out.json"]
     assert main(["segment", "many/0.csv", f"{tmp_path}/bad.csv", *arguments, "--workers", "2"]) == 2
     assert "bad.csv: " in (said := capfd.readouterr().err) and said.count("\n") == 1
     assert not (tmp_path / "out.json").exists()
+    (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')
+    assert main(["segment", "many", "--task", "order.toml", "--workers", "2"]) == 2
+    assert "go with tasks of blocks alone" in capfd.readouterr().err
+    for name in ("b.csv", "a.CSV", "rig.toml", "c.npz"):
+        (tmp_path / name).touch()
+    (tmp_path / "inner").mkdir()
+    found = recordings_in([tmp_path / "b.csv", tmp_path])
+    assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
+    refused("no recordings in this folder", recordings_in, [tmp_path / "inner"])
 
 
 @pytest.mark.parametrize(("more", "said"), [
@@ -99,19 +108,6 @@ def test_refusals(lab, more, said, capfd, monkeypatch):
         pytest.importorskip("dask.distributed", reason="dask is not installed (extra cluster)")
     assert main(["segment", "many", "--task", "task.toml", "--rig", "rig.toml", *more]) == 2
     assert said in capfd.readouterr().err
-
-
-def test_a_folder_stands_for_its_recordings_and_plain_sequences_are_pooled(lab, capfd, tmp_path):
-    (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')
-    assert main(["segment", "many", "--task", "order.toml", "--workers", "2"]) == 2
-    assert "go with tasks of blocks alone" in capfd.readouterr().err
-    for name in ("b.csv", "a.CSV", "rig.toml", "c.npz"):
-        (tmp_path / name).touch()
-    (tmp_path / "inner").mkdir()
-    found = recordings_in([tmp_path / "b.csv", tmp_path])
-    assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
-    with pytest.raises(InputError, match="no recordings in this folder"):
-        recordings_in([tmp_path / "inner"])
 
 
 class Deadly(Executor):

@@ -31,13 +31,24 @@ HEADLESS = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run",
 SWING = Path(__file__).resolve().parents[1] / "simgap_swing.py"
 
 
-def test_effects_are_listed_with_priors(tmp_path, capsys):
+def test_effects_are_listed_with_priors_and_experiments_with_what_they_promise(tmp_path, capsys):
     assert main(["effects", "--json", str(tmp_path / "e.json")]) == 0
     document = json.loads((tmp_path / "e.json").read_text())
     assert document["format"] == "hmmseg.effects/1"
     bias = next(e for e in document["effects"] if e["name"] == "force_bias")
     assert [p["name"] for p in bias["parameters"]] == ["fx1", "fy1", "fx2", "fy2"]
     assert bias["parameters"][0]["unit"] == "N" and "force_bias" in capsys.readouterr().out
+    asked = {"do": "work twice as fast", "separates": ["force_lag", "force_lowpass"],
+             "expected_gain_nats": 41.3}  # fmt: skip
+    body = {"probabilities": {"force_lag": 1.0}, "causes": [], "where": [], "next_experiment": asked}
+    sink = io.StringIO()
+    console = Console(width=120, file=sink)
+    for table in tables(body):
+        console.print(table)
+    said = sink.getvalue()
+    assert "work twice as fast" in said
+    assert "expected to separate force_lag, force_lowpass, by 41 nats at least" in said
+    assert len(tables(body | {"next_experiment": None})) == len(tables(body)) - 1
 
 
 def test_contradicting_scales_and_trials_told_twice_are_refused_before_any_search(tmp_path, capsys):
@@ -50,20 +61,6 @@ def test_contradicting_scales_and_trials_told_twice_are_refused_before_any_searc
     trial = str(FOLDER / "trial_01.csv")
     assert main(["diagnose", trial, *hand, "--healthy", trial]) == 2
     assert "the same trial as" in capsys.readouterr().err
-
-
-def test_the_next_experiment_says_what_it_promises():
-    asked = {"do": "work twice as fast", "separates": ["force_lag", "force_lowpass"],
-             "expected_gain_nats": 41.3}  # fmt: skip
-    body = {"probabilities": {"force_lag": 1.0}, "causes": [], "where": [], "next_experiment": asked}
-    sink = io.StringIO()
-    console = Console(width=120, file=sink)
-    for table in tables(body):
-        console.print(table)
-    said = sink.getvalue()
-    assert "work twice as fast" in said
-    assert "expected to separate force_lag, force_lowpass, by 41 nats at least" in said
-    assert len(tables(body | {"next_experiment": None})) == len(tables(body)) - 1
 
 
 def named(gone: float | None) -> dict:
@@ -114,20 +111,23 @@ def test_the_page_opens_in_a_browser(tmp_path):
     assert picture.stat().st_size > 50_000  # figures and all; a blank page has a tenth of it
 
 
-@pytest.fixture(scope="module")
-def logs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("logs")
-    for seed in range(2):
-        found = log(seed, seconds=4.0, viscous=0.004)
+def swung(folder, seeds, **changed) -> list[str]:
+    """Files of logs of a pendulum with some parameters changed."""
+    for seed in seeds:
+        found = log(seed, seconds=4.0, **changed)
         rows = np.column_stack([found.t, found["torque"], found["angle"]])
         np.savetxt(folder / f"{seed}.csv", rows, delimiter=",", header="t,torque,angle", comments="")
-    return [str(folder / f"{seed}.csv") for seed in range(2)]
+    return [str(folder / f"{seed}.csv") for seed in seeds]
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    return swung(tmp_path_factory.mktemp("logs"), range(2), viscous=0.004)  # which its model lacks
 
 
 @pytest.mark.slow
 def test_a_cause_is_named_and_patched(logs, tmp_path):
-    target, patch = tmp_path / "out.json", tmp_path / "patch"
-    page = tmp_path / "page.html"
+    target, patch, page = (tmp_path / name for name in ("out.json", "patch", "page.html"))
     options = ["--json", str(target), "--patch", str(patch), "--report", str(page), "--quiet"]
     assert main(["diagnose", *logs, "--simulator", f"{SWING}:Swing", *options]) == 0
     found = json.loads(target.read_text())
@@ -154,8 +154,7 @@ def test_a_cause_is_named_and_patched(logs, tmp_path):
     (["--simulator", f"{SWING}:Swing", "--rig", "rig.toml"], "--rig: does not go with a simulator"),
     (["--simulator", f"{SWING}:Swing", "--effect", "viscos"], r"is no candidate; expected .*viscous"),
     (["--simulator", f"{SWING}:Swung"], "did you mean Swing"),
-    (["--mjcf", "robot.xml", "--map", "map.toml"], "no such file"),
-])  # fmt: skip
+    (["--mjcf", "robot.xml", "--map", "map.toml"], "no such file")])  # fmt: skip
 def test_what_does_not_go_together_is_said(logs, capsys, options, line):
     assert main(["diagnose", *logs, *options]) == 2
     told = capsys.readouterr().err
@@ -164,24 +163,17 @@ def test_what_does_not_go_together_is_said(logs, capsys, options, line):
 
 @pytest.mark.slow
 def test_what_changed_since_healthy_logs_is_named(logs, tmp_path):
-    folder = tmp_path
-    for seed in range(3):
-        found = log(seed + 10, seconds=4.0)
-        rows = np.column_stack([found.t, found["torque"], found["angle"]])
-        np.savetxt(folder / f"old_{seed}.csv", rows, delimiter=",", header="t,torque,angle", comments="")
-    old = [str(folder / f"old_{seed}.csv") for seed in range(3)]
-    target, page = folder / "out.json", folder / "page.html"
-    kept = folder / "history.jsonl"
-    options = ["--simulator", f"{SWING}:Swing", "--json", str(target), "--report", str(page), "--quiet"]
-    options += ["--history", str(kept)]
-    patch = ["--patch", str(folder / "patch")]
+    old, patch = swung(tmp_path, range(10, 13)), ["--patch", str(tmp_path / "patch")]
+    target, page, kept = (tmp_path / name for name in ("out.json", "page.html", "history.jsonl"))
+    options = ["--simulator", f"{SWING}:Swing", "--json", str(target), "--report", str(page), "--quiet",
+               "--history", str(kept)]  # fmt: skip
     assert main(["diagnose", *logs, "--healthy", *old, *options, *patch]) == 0
     found = json.loads(target.read_text())
     assert found["verdict"] == "named" and found["causes"] == ["viscous"]
     told = found["effects"]["viscous"]["parameters"]["viscous"]
     assert told["interval_90"][0] < 0.004 < told["interval_90"][1] and told["old"] == 0.0
     assert abs(sum(found["probabilities"].values()) - 1) < 1e-9 and "iscous" in page.read_text()
-    ranges = json.loads((folder / "patch" / "ranges.json").read_text())
+    ranges = json.loads((tmp_path / "patch" / "ranges.json").read_text())
     assert ranges["causes"]["viscous"]["parameters"]["viscous"]["range"] == told["interval_90"]
     (run,) = map(json.loads, kept.read_text().splitlines())
     assert run["parameters"]["viscous"]["interval_90"] == told["interval_90"]

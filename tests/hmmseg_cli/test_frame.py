@@ -30,7 +30,7 @@ def task(tmp_path) -> Path:
     return path
 
 
-def test_processes_say_one_line_of_bad_input_and_show_the_traceback_of_a_bug(tmp_path, task):
+def test_processes_say_one_line_of_bad_input_and_show_the_traceback_of_a_bug(tmp_path):
     (tmp_path / "bad.toml").write_text(TASK.replace('to = "ground"', 'to = "table"'))
     done = run("decompose", "bad.toml", "--json", "out.json", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
@@ -43,7 +43,9 @@ def test_processes_say_one_line_of_bad_input_and_show_the_traceback_of_a_bug(tmp
         hmmseg.contact.decompose.decompose = lambda task: 1 / 0
         sys.exit(main.main(["decompose", sys.argv[1]]))
     """
-    done = subprocess.run([sys.executable, "-c", code, task], capture_output=True, text=True, check=False)
+    (tmp_path / "good.toml").write_text(TASK)
+    command = [sys.executable, "-c", code, tmp_path / "good.toml"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stderr.startswith("Traceback")
     assert done.stderr.endswith("ZeroDivisionError: division by zero\n")
 
@@ -80,8 +82,7 @@ def test_version_and_help_with_groups_and_examples(capsys):
     (["decompose", "a", "--seed", "-1"], "hmmseg decompose: Invalid value for '--seed'"),
     (["decompose", "a", "--json"], "hmmseg: Option '--json' requires an argument"),
     (["--nonsense"], "hmmseg: No such option: --nonsense"),
-    (["decompose", "absent.toml"], "absent.toml: no such file; expected a TOML file"),
-])  # fmt: skip
+    (["decompose", "absent.toml"], "absent.toml: no such file; expected a TOML file")])  # fmt: skip
 def test_usage_at_fault(capsys, args, line):
     assert frame.main(args) == 2
     out, err = capsys.readouterr()
@@ -114,8 +115,7 @@ def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
     ({"json": "{}/file/a.json"}, "--json .*file is not a folder; expected a folder"),
     ({"report": "{}/a.json"}, "--report .*a.json: unknown kind of file; expected .html or .htm"),
     ({"figures": "{}/file"}, "--figures .*file is not a folder; expected a folder"),
-    ({"figures": "{}/file/below"}, "--figures .*file is not a folder"),
-])  # fmt: skip
+    ({"figures": "{}/file/below"}, "--figures .*file is not a folder")])  # fmt: skip
 def test_destinations_are_checked_beforehand(tmp_path, arguments, message):
     (tmp_path / "file").write_text("")
     given = {name: value.format(tmp_path) for name, value in arguments.items()}
@@ -126,10 +126,11 @@ def test_destinations_are_checked_beforehand(tmp_path, arguments, message):
 
 def test_destinations_are_links_and_devices_but_none_without_permission(tmp_path, monkeypatch):
     (tmp_path / "a.json").write_text("old")
-    monkeypatch.setattr("hmmseg_cli.console.os.access", lambda path, mode: False)  # root may write anywhere
-    for arguments in ({"json": str(tmp_path / "a.json")}, {"json": str(tmp_path / "b.json")},
-                      {"report": tmp_path / "c.html"}, {"figures": tmp_path / "d"}):  # fmt: skip
-        refused("cannot be written", Output, "test", **arguments)
+    with monkeypatch.context() as patched:
+        patched.setattr("hmmseg_cli.console.os.access", lambda path, mode: False)  # root may write anywhere
+        for arguments in ({"json": str(tmp_path / "a.json")}, {"json": str(tmp_path / "b.json")},
+                          {"report": tmp_path / "c.html"}, {"figures": tmp_path / "d"}):  # fmt: skip
+            refused("cannot be written", Output, "test", **arguments)
     (tmp_path / "real.json").write_text("old")
     (tmp_path / "link.json").symlink_to("real.json")
     for name in (str(tmp_path / "link.json"), os.devnull):
@@ -184,16 +185,13 @@ def test_standard_output_is_kept_clean_and_quiet(capsys):
     assert tuple(capsys.readouterr()) == ("", "")
 
 
-def test_strict_json():
+def test_documents_are_strict_json_and_trials_distinct(tmp_path):
     document = {"a": np.array([1.0, np.nan]), "b": (np.float32(0.5), np.int64(3), np.bool_(True)),
                 "c": float("inf"), "d": [float("-inf"), None, "x"], "e": Path("p"), 3: "µ"}  # fmt: skip
     plain = {"a": [1.0, None], "b": [0.5, 3, True], "c": None, "d": [None, None, "x"], "e": "p", "3": "µ"}
     assert json.loads(strict_json(document), parse_constant=pytest.fail) == plain
     with pytest.raises(TypeError):
         strict_json({"a": object()})
-
-
-def test_distinct_trials(tmp_path):
     paths = [tmp_path / "a.csv", tmp_path / "b.csv", tmp_path / "copy.csv"]
     for path, text in zip(paths, "aba", strict=True):
         path.write_text(text)

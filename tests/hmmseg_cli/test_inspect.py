@@ -113,7 +113,7 @@ def test_what_is_in_a_file_a_log_and_a_file_of_several(tmp_path, capsys):
     assert left.rate is None and left.missing == 95
     assert (channel.unit, channel.missing, note.text, found.mapping) == ("N", 1, True, {})
     assert channel.maximum == pytest.approx(np.nanmax(force))
-    log = inspect(file_writers.write_mcap(tmp_path / "a.mcap"))
+    log = inspect(file_writers.mcap_of(tmp_path / "a.mcap", file_writers.planted()))
     rates = {channel.name: channel.rate for channel in log.channels}
     assert rates["/wrench.wrench.force.x"] == pytest.approx(100.0)
     assert rates["/pose.pose.position.z"] == pytest.approx(20.0)
@@ -143,8 +143,7 @@ def test_nothing_is_proposed_where_nothing_is_needed(case):
     (["t", "joint1_1", "joint1_2", "joint2_1", "joint2_2", "F1x", "F1y", "F2x", "F2y"],
      {"q11": "joint1_1", "q12": "joint1_2", "q21": "joint2_1", "q22": "joint2_2", "fx1": "F1x",
       "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
-    (["t", "temperature", "pressure"], {}),
-])  # fmt: skip
+    (["t", "temperature", "pressure"], {})])  # fmt: skip
 def test_names_taken_apart(names, expected):
     table = make_table("a", {name: np.zeros(9) for name in names})
     assert {ours: fields["from"] for ours, fields in propose(table).items()} == expected
@@ -178,8 +177,7 @@ def test_an_empty_file_is_refused(tmp_path, capsys, text):
 @pytest.mark.parametrize(("rig", "line"), [
     ("[columns]\nx1 = 'a'\n", "--write .*rig.toml: already has .columns.; expected a rig without it"),
     ("rate = -1", "rig.toml: key rate: "),
-    ("rate = ", "rig.toml: not valid TOML"),
-])  # fmt: skip
+    ("rate = ", "rig.toml: not valid TOML")])  # fmt: skip
 def test_a_rig_that_cannot_take_the_mapping_stays_as_it_was(tmp_path, capsys, rig, line):
     ours = dict(CARTESIAN)
     pd.DataFrame({"time": ours.pop("t"), **ours}).to_csv(tmp_path / "a.csv", index=False)
@@ -249,8 +247,7 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
     found = read_map(tmp_path / "map.toml")
     assert {n: (m.thing, m.kind) for n, m in found.columns.items()} == {
         "elbow_deg": ("joint", "position"), "elbow_vel": ("joint", "velocity"),
-        "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force"),
-    }  # fmt: skip
+        "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force")}  # fmt: skip
     assert (found.clock.column, found.clock.size) == ("ros_stamp", 1e-9)
     assert main(["new", str(tmp_path / "other"), "--model", str(tmp_path / "robot.xml")]) == 2
 

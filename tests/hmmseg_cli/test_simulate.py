@@ -51,8 +51,7 @@ def test_trials_are_written_as_a_folder_of_recordings(tmp_path, inputs):
 
 @pytest.mark.parametrize("more", [
     '[columns]\nt = {from = "stamp", unit = "ms"}\nx1 = {from = "left [mm]", unit = "mm"}\n',
-    '[gripper]\nposition = ["x", "y", "z"]\nopening = "w"\nwrench = ["fx", "fy", "fz"]\n',
-])  # fmt: skip
+    '[gripper]\nposition = ["x", "y", "z"]\nopening = "w"\nwrench = ["fx", "fy", "fz"]\n'])  # fmt: skip
 def test_the_rig_that_is_written_reads_the_trials_that_are(tmp_path, inputs, more):
     (tmp_path / "rig.toml").write_text("rate = 50.0\n" + more)
     out = tmp_path / "out"
@@ -80,8 +79,7 @@ def test_a_replay_predicts_the_recording_s_forces(tmp_path, inputs):
     (["--output", "."], "would replace the input"),
     (["--replay", "trial.csv", "--trials", "2"], "goes with neither"),
     (["--properties", "none.json"], "none.json: no such file"),
-    (["--operator", "operator.toml"], "unknown key; expected one of"),
-])  # fmt: skip
+    (["--operator", "operator.toml"], "unknown key; expected one of")])  # fmt: skip
 def test_what_is_refused_writes_nothing(tmp_path, inputs, more, message, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "operator.toml").write_text("gripp = 2.0\n")

@@ -31,7 +31,7 @@ def run(monkeypatch, capsys):
     return run
 
 
-def test_one_line_a_row_and_a_last_one(run, tmp_path):
+def test_one_line_a_row_and_a_last_one_or_a_live_picture_of_where_the_task_is(run, tmp_path):
     code, lines, err = run(ROWS, "--json", str(tmp_path / "out.json"))
     assert code == 0 and err == ""
     assert len(lines) == len(ROWS)  # the header's place is taken by the last line
@@ -39,6 +39,19 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
     assert lines[-1]["final"] and lines[-1]["fits"] and lines[-1]["format"] == "hmmseg.watch/1"
     assert [s["subtask"] for s in lines[-1]["segments"]][:3] == ["pregrasp", "pickup", "carry"]
     assert json.loads((tmp_path / "out.json").read_text())["segments"] == lines[-1]["segments"]
+    watcher = Watcher(COMMAND[2], COMMAND[4])
+    live = Live(watcher)
+    live._console.file = io.StringIO()
+    for row in ROWS[1:60]:
+        t, *values = map(float, row.split(","))
+        answer = watcher.update(t, values)
+        live.update(answer)
+    live.close()
+    console = Console(file=io.StringIO(), width=140)
+    console.print(picture(watcher, answer, list(live._kept), ["a note"]))
+    text = console.file.getvalue()
+    assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
+    assert spark([0.0, float("nan"), 2.0]) == "▁ █ 2.00 N at most"
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -50,9 +63,7 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
     (lambda rows: rows[:1], "the stream: has no rows; expected a row for every sample"),
     (
         lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
-        "row 6, column fy2: 1e+300 is no",
-    ),
-])  # fmt: skip
+        "row 6, column fy2: 1e+300 is no")])  # fmt: skip
 def test_bad_input_gets_one_line(run, change, message):
     code, _, err = run(change(ROWS[:10]))
     assert code == 2 and len(err.splitlines()) == 1 and message in err
@@ -107,19 +118,3 @@ def test_bad_rows_and_one_that_breaks_off_can_be_left_out(run):
     assert lines[-1]["warnings"][0] in err
     whole = run(ROWS[:20], end="")[1]
     assert whole[-1]["counts"] == lines[-1]["counts"] and whole[-1]["segments"] == lines[-1]["segments"]
-
-
-def test_the_live_picture_shows_where_the_task_is():
-    watcher = Watcher(COMMAND[2], COMMAND[4])
-    live = Live(watcher)
-    live._console.file = io.StringIO()
-    for row in ROWS[1:60]:
-        t, *values = map(float, row.split(","))
-        answer = watcher.update(t, values)
-        live.update(answer)
-    live.close()
-    console = Console(file=io.StringIO(), width=140)
-    console.print(picture(watcher, answer, list(live._kept), ["a note"]))
-    text = console.file.getvalue()
-    assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
-    assert spark([0.0, float("nan"), 2.0]) == "▁ █ 2.00 N at most"

@@ -151,12 +151,19 @@ def test_the_bayes_factor_bounds_alarms_and_healthy_recordings_are_taken_until_i
     assert search.detected(10.5, others).p_value >= 2 / 5
 
 
-def test_neighbours_are_screened_by_what_one_step_of_each_gives():
+def test_neighbours_are_screened_by_a_step_and_linearised_beside_those_that_act():
     f = forms(gap_of({0: 3.0, 2: -2.0}))
     m, sets = fitted(f, (0,)), [(), (0, 2), (1,), (1, 3), (0, 1, 2)]
     each = [mode(f, quadratic_forms(f, e), m.precision, steps=1).score for e in sets]
     # but for the volume of the mode, by how groups count before the step
     np.testing.assert_allclose(screened(f, m, sets), each, atol=0.2)
+    gap = gap_of({0: 3.0, 1: 2.0})
+    a, b, c, d = gap.candidates
+    after_a, joint = replace(b, beside=("a",)), [replace(a, beside=("b", "c")), replace(b, beside=("a", "c"))]
+    f = forms(replace(gap, candidates=(a, b, c, d, after_a, *joint)))
+    assert {e for e in search._neighbours(f, (0, 4)) if len(e) == 3} == {(2, 5, 6), (0, 3, 4)}
+    assert search._linearised(f, [0, 1]) == (0, 4)  # beside `a`, and nothing that does not act
+    assert search._linearised(f, [0, 1, 2]) == (2, 5, 6) and search._linearised(f, [1]) == (1,)
 
 
 def test_what_acts_is_named_once_and_what_cannot_act_is_not_taken():
@@ -207,7 +214,12 @@ def test_of_a_planted_cell_and_effect_size_and_share_are_told():
     assert {(c.channel) for c in found.where} <= {"c0", "c1"}
 
 
-def test_nothing_remains_of_a_gap_that_is_lost_in_the_whole_noise_once_explained():
+def test_two_effects_one_or_none_are_told_and_nothing_remains_of_a_gap_once_explained():
+    assert attribute(gap_of({0: 3.0, 2: 3.0}), heldout=False).causes == ("a", "c")
+    healthy = attribute(gap_of({}, seed=5))
+    assert healthy.verdict == "none" and healthy.where == () and healthy.how_far is None
+    alike = attribute(gap_of({0: 3.0}, same=True), heldout=False)
+    assert alike.verdict == "set" and {*alike.causes, *alike.indistinguishable} == {"a", "b"}
     rows, rng = rows_of(channels=1, parts=6), np.random.default_rng(0)
     calm = rows.part == 0
     push = rng.standard_normal(rows.time.size) * calm
@@ -231,14 +243,6 @@ def test_a_tolerant_prior_leaves_what_matters_as_likely_and_rounding_no_probabil
     assert (
         prior[b.log_phi.searchsorted(np.log(5.0)), 2] > b.log_prior[b.log_phi.searchsorted(np.log(5.0))] + 2
     )
-
-
-def test_two_effects_a_healthy_recording_and_effects_that_nothing_tells_apart():
-    assert attribute(gap_of({0: 3.0, 2: 3.0}), heldout=False).causes == ("a", "c")
-    healthy = attribute(gap_of({}, seed=5))
-    assert healthy.verdict == "none" and healthy.where == () and healthy.how_far is None
-    alike = attribute(gap_of({0: 3.0}, same=True), heldout=False)
-    assert alike.verdict == "set" and {*alike.causes, *alike.indistinguishable} == {"a", "b"}
 
 
 def test_what_no_effect_explains_is_unknown_and_told_where_and_of_a_sliver_too():
@@ -346,17 +350,12 @@ def test_what_one_trial_alone_says_or_changes_sign_between_trials_is_no_cause():
     assert attribute(gap).verdict == "unknown"
 
 
-def test_causes_of_less_than_the_wanted_share_of_held_out_gap_are_unknown():
-    """A cause that surely acts, in a gap most of which is something else: in the other channels."""
+def test_causes_are_known_by_what_they_leave_of_the_gap_however_little_it_was():
     gap = gap_of({0: 3.0}, seed=6)
     rest = 9.0 * np.sin(gap.rows.time * 40.0 + gap.rows.trial) * (gap.rows.channel == 2)
     found = attribute(replace(gap, residual=gap.residual + rest))
     assert found.verdict == "unknown" and found.probabilities["unknown"] > 0.5
     assert attribute(gap).causes == ("a",)
-
-
-def test_a_cause_that_leaves_nothing_that_can_be_seen_is_known_however_little_it_was():
-    """Noise of nine times the squares that there are: no share is certain, unless something is left."""
     gap = gap_of({0: 3.0}, seed=6)
     rest = 9.0 * np.sin(gap.rows.time * 40.0 + gap.rows.trial) * (gap.rows.channel == 2)
     for more, likely in ((0.0, True), (rest, False)):
@@ -387,13 +386,21 @@ def test_an_effect_that_wanders_has_an_interval_that_holds_its_mean(wander):
     assert sum(plain) < 20 if wander else np.median(widened) < 1
 
 
-def test_a_measurement_that_trials_contradict_is_named_though_no_trial_is_predicted_better():
+def test_what_trials_or_other_evidence_say_of_an_effect_counts_though_no_trial_is_predicted_better():
     rows = rows_of(samples=30)
     column = np.where(rows.channel == 0, 3.0, 0.0)[:, None]  # by one sd of what was measured
     residual = np.random.default_rng(0).standard_normal(rows.time.size) + 9.0 * column[:, 0]
     wrong = linear("measured", column, scale=10.0)
     found = attribute(Gap(rows, residual, column, (wrong, linear("other", column[::-1].copy()))))
     assert (found.verdict, found.causes) == ("named", ("measured",)) and found.how_far.fraction > 0.9
+    gap = gap_of({0: 30.0})
+    nothing, n = np.zeros(0), gap.residual.size
+    lattice = Candidate("lattice", (), nothing, nothing, nothing, np.zeros(n), np.zeros((n, 0)), nothing,
+                        nothing, np.full(n, 1e-3))  # fmt: skip
+    for evidence, kept in ((400.0, True), (0.0, False)):
+        f = forms(replace(gap, candidates=(*gap.candidates, replace(lattice, evidence=evidence))))
+        others = Heldout.of(f, np.ones(3), (0, 4))
+        assert (4 in _predicting(others, (0, 4))) == kept
 
 
 def one(name: str, weight: float, known: float = 1.0, causes: tuple[str, ...] | None = None) -> Explanation:
@@ -475,27 +482,6 @@ def test_causes_and_what_takes_their_place(sets, more, causes, others):
     told = conclude(sets, **{"p_value": SURE} | more)
     assert (told.causes, told.indistinguishable) == (causes, others)
     assert told.verdict == ("set" if others else "named")
-
-
-def test_an_effect_is_taken_as_linearised_beside_those_that_it_acts_with():
-    gap = gap_of({0: 3.0, 1: 2.0})
-    a, b, c, d = gap.candidates
-    after_a, joint = replace(b, beside=("a",)), [replace(a, beside=("b", "c")), replace(b, beside=("a", "c"))]
-    f = forms(replace(gap, candidates=(a, b, c, d, after_a, *joint)))
-    assert {e for e in search._neighbours(f, (0, 4)) if len(e) == 3} == {(2, 5, 6), (0, 3, 4)}
-    assert search._linearised(f, [0, 1]) == (0, 4)  # beside `a`, and nothing that does not act
-    assert search._linearised(f, [0, 1, 2]) == (2, 5, 6) and search._linearised(f, [1]) == (1,)
-
-
-def test_what_is_known_of_a_random_effect_from_elsewhere_no_form_imitates():
-    gap = gap_of({0: 30.0})
-    nothing, n = np.zeros(0), gap.residual.size
-    lattice = Candidate("lattice", (), nothing, nothing, nothing, np.zeros(n), np.zeros((n, 0)), nothing,
-                        nothing, np.full(n, 1e-3))  # fmt: skip
-    for evidence, kept in ((400.0, True), (0.0, False)):
-        f = forms(replace(gap, candidates=(*gap.candidates, replace(lattice, evidence=evidence))))
-        others = Heldout.of(f, np.ones(3), (0, 4))
-        assert (4 in _predicting(others, (0, 4))) == kept
 
 
 def problem(seed, size=6, tight=1.0):

@@ -108,8 +108,7 @@ def test_a_mass_off_the_middle_turns_the_block_until_moments_balance():
 
 @pytest.mark.parametrize(("name", "values"), [
     ("joint_offset", {"q11": 0.01, "q12": -0.005, "q21": 0.0, "q22": 0.02}),
-    ("link_length", {"scale": 0.02}),
-])  # fmt: skip
+    ("link_length", {"scale": 0.02})])  # fmt: skip
 def test_kinematic_effects_are_undone_in_tip_positions(name, values):
     truth, effect = performance(), catalogue()[name]
     recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))

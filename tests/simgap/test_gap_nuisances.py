@@ -19,7 +19,7 @@ from simgap.gap.residuals import _misread_moment, residuals, turned
 from simgap.phases import Phase
 
 
-def test_products_are_those_of_the_marginal_density():
+def test_products_are_marginal_and_a_finger_that_presses_on_is_no_gap():
     rng = np.random.default_rng(0)
     columns, a, b = rng.normal(size=(30, 4)), rng.normal(size=(30, 3)), rng.normal(size=30)
     columns[:, 3] = columns[:, 2]  # the same unknown twice
@@ -28,6 +28,11 @@ def test_products_are_those_of_the_marginal_density():
     np.testing.assert_allclose(nuisances.product(a, b), a.T @ inverse @ b, atol=1e-10)
     np.testing.assert_allclose(nuisances.product(a, a), a.T @ inverse @ a, atol=1e-10)
     np.testing.assert_allclose(nuisances.left(b), inverse @ b, atol=1e-10)
+    t, force = np.arange(10) / 20.0, np.zeros((10, 4))
+    force[0] = -0.065, 0.02, -0.30, -0.41  # the right finger leaves last, while the left one rings
+    force[1] = 0.3, 0.2, -0.3, 0.2  # late forces of both
+    found = _one_finger(t, force, np.zeros(10, int), np.ones(10, bool), np.array([0.0]), np.full(10, 0.01))
+    np.testing.assert_array_equal(np.flatnonzero(found), [0])
 
 
 @pytest.mark.parametrize(("level", "colour"), [(1.0, 0.0), (1.3, 0.0), (0.8, 0.3)])
@@ -198,11 +203,3 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
     # Predictions from the samples before miss it once, at the first that is in the air.
     first = np.flatnonzero(there & (arrays.phase[0, :, Phase.CARRY] > 0))[0]
     assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05) and np.abs(change[:first]).max() < 1e-9
-
-
-def test_a_finger_that_still_presses_harder_is_no_gap_and_forces_in_balance_may_be_one():
-    t, force = np.arange(10) / 20.0, np.zeros((10, 4))
-    force[0] = -0.065, 0.02, -0.30, -0.41  # the right finger leaves last, while the left one rings
-    force[1] = 0.3, 0.2, -0.3, 0.2  # late forces of both
-    found = _one_finger(t, force, np.zeros(10, int), np.ones(10, bool), np.array([0.0]), np.full(10, 0.01))
-    np.testing.assert_array_equal(np.flatnonzero(found), [0])

@@ -256,8 +256,7 @@ def test_plain_tasks_need_simulated_trials_and_settled_boundaries(folder, tmp_pa
     (["--actual", "actual.toml"], "does not go with --against"),
     (["--healthy", "sim_04.csv"], "does not go with --against"),
     (["--effect", "grip_slip"], "needs the virtual model"),
-    (["--against", "real_00.csv"], "the same trial as"),
-])  # fmt: skip
+    (["--against", "real_00.csv"], "the same trial as")])  # fmt: skip
 def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypatch, more, line):
     monkeypatch.chdir(folder)
     (folder / "actual.toml").write_text("")

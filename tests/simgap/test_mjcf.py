@@ -163,9 +163,7 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
         ("window = 1e9", "window.*equal to 1000000"), ('window = "long"', "window"),
         ("window = nan", "window"), ("time = 3", "time"), ("time = []", "time"),
         ('time = {column = "t", unit = "parsec"}', "unit"), ("keyframe = 3", "keyframe.*valid string"),
-        ('keyframe = "home"', "no keyframe home; expected no name"), ("windw = 1", "windw"),
-    ]),
-])  # fmt: skip
+        ('keyframe = "home"', "no keyframe home; expected no name"), ("windw = 1", "windw")])])  # fmt: skip
 def test_a_map_at_fault_is_said_in_a_line(files, described, line):
     refused(line, load_mjcf, *files(described=described))
 
@@ -178,19 +176,24 @@ def test_a_model_whose_time_step_is_none(files, step):
 @pytest.mark.parametrize(("xml", "line"), [
     (XML.replace('axis="0 1 0" range="-3 3"', 'type="ball"').replace("motor name", 'motor gear="1 0 0" name'),
      "columns.q.joint: pivot is no hinge or slide; expected the seven columns"),
-    (XML.replace("</worldbody>", ""), "does not read it: .*line number=.*worldbody"),
-])  # fmt: skip
+    (XML.replace("</worldbody>", ""), "does not read it: .*line number=.*worldbody")])  # fmt: skip
 def test_a_model_at_fault_is_said_in_a_line(files, xml, line):
     refused(f"(?i){line}", load_mjcf, *files(xml))
 
 
-def test_a_candidate_or_a_payload_that_is_nowhere_is_said(files):
+def test_loads_are_carried_by_the_tool_of_the_last_link_or_where_they_are_said_to_be(files):
     refused("no joint elbow", loaded, files, "joint:elbow.damping")
     refused("has no dampin that can be", loaded, files, "joint:pivot.dampin")
     with pytest.raises(InputError, match=r"payload_at.arm: the model has no site tol.*tool"):
         load_mjcf(*files(SERVO % "", 'payload_at = {arm = "tol"}\n' + TURN))
     with pytest.raises(InputError, match=r"payload_at.arm: .*name of a site"):
         load_mjcf(*files(SERVO % "", "payload_at = {arm = 3}\n" + TURN))
+    tool = '<body name="hand" pos="0.3 0 0"><geom size="0.01" mass="0.2" contype="0" conaffinity="0"/></body>'
+    offered = turning(files, TURN, tool)[0].simulator.parameters
+    assert {"body:arm.mass", "body:hand.mass", "body:hand.com_x", "body:hand.payload"} <= {*offered}
+    assert "body:arm.payload" not in offered
+    stated = turning(files, 'payload_at = {arm = "tool"}\n' + TURN, tool)[0].simulator.parameters
+    assert "body:arm.payload" in stated and "body:hand.payload" not in stated
 
 
 def test_degrees_of_angles_and_of_rates_are_named(files, tmp_path):
@@ -293,8 +296,7 @@ def test_masses_stay_within_what_a_robot_can_have_and_numerics_are_no_candidates
 @pytest.mark.parametrize(
     ("own", "name", "other"),
     [("RK4", "timestep", "Euler"), ("RK4", "integrator", "implicit"), ("Euler", "integrator", "implicit"),
-     ("implicit", "integrator", "Euler")],
-)  # fmt: skip
+     ("implicit", "integrator", "Euler")])  # fmt: skip
 def test_another_integrator_errs_as_the_numerics_say(files, own, name, other):
     """Whole it is that integrator's run; a third of Euler's error is what it errs at a third of the step."""
 
@@ -346,39 +348,25 @@ def turning(files, described: str = TURN, more: str = "", u: np.ndarray | None =
     return found, run
 
 
-@pytest.mark.parametrize(("kind", "number", "other"), [
-    ("muscle", 'lengthrange="-1 1" force="%s"', ""), ("damper", 'kv="%s" ctrlrange="0 1"', ""),
-    ("dcmotor", 'motorconst="%s" resistance="20"', "DCMOTOR"),
+@pytest.mark.parametrize(("kind", "number"), [
+    ("muscle", 'lengthrange="-1 1" force="%s"'), ("damper", 'kv="%s" ctrlrange="0 1"'),
+    ("dcmotor", 'motorconst="%s" resistance="20"'), ("position", 'kp="%s"'), ("velocity", 'kv="%s"'),
 ])  # fmt: skip
-def test_the_gain_of_any_actuator_is_its_strength(files, kind, number, other):
+def test_the_gain_of_any_actuator_is_its_strength_or_how_stiffly_it_follows(files, kind, number):
     """The first of a muscle's numbers is a length, of a motor's a resistance, and a damper's is zero."""
-    if other and not hasattr(mujoco.mjtGain, f"mjGAIN_{other}"):
+    if kind == "dcmotor" and not hasattr(mujoco.mjtGain, "mjGAIN_DCMOTOR"):
         pytest.skip("not in this MuJoCo")
     driven = XML.replace('<motor name="m" joint="pivot"/>', f'<{kind} name="m" joint="pivot" {number}/>')
+    unit = {"position": 'unit = "rad"', "velocity": 'unit = "rad/s"'}.get(kind, "")
     log = Recording("a.csv", np.arange(0, 0.5, 0.01), {"q": np.zeros(50), "u": np.full(50, 0.5)})
 
     def run(strength: float, **changed: float) -> np.ndarray:
-        found = load_mjcf(*files(driven % strength, MAP.replace('unit = "Nm"', "")))
+        found = load_mjcf(*files(driven % strength, MAP.replace('unit = "Nm"', unit)))
         found.effects([log])
         return found.simulator.simulate(changed, log, {"q": 0.5, "q_rate": 2.0})["q"]
 
     assert np.ptp(run(0.5) - run(0.4)) > 1e-3
     np.testing.assert_allclose(run(0.5, **{"actuator:m.gain": -0.2}), run(0.4), atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", ["position", "velocity"])
-def test_the_gain_of_a_servo_is_how_stiffly_it_follows(files, kind):
-    def run(stiff: float, **changed: float) -> np.ndarray:
-        number = {"position": "kp", "velocity": "kv"}[kind]
-        servo = SERVO.replace('<position name="servo" joint="turn" kp="40" kv="2"/>',
-                              f'<{kind} name="servo" joint="turn" {number}="{stiff}"/>')  # fmt: skip
-        found, _ = turning(lambda *given: files(servo % "", given[1]))
-        values = {n: s.nominal for n, s in found.simulator.settings.items()} | changed
-        log = Recording("a.csv", t, {"q": 0 * t, "u": 0.3 * np.sin(6 * t)})
-        return found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 1.8})["q"]
-
-    t = np.arange(0, 2, 0.01)
-    np.testing.assert_allclose(run(2.0, **{"actuator:servo.gain": -0.2}), run(1.6), atol=1e-9)
 
 
 def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
@@ -396,7 +384,7 @@ def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
     assert np.abs(run(option__hold=1.0, option__late=0.5) - run(option__hold=1.0)).max() > 1e-4
 
 
-def test_smoothed_commands_are_means_with_their_neighbours(files):
+def test_smoothed_commands_are_means_and_play_lags_at_turns(files):
     u = np.random.default_rng(0).uniform(-0.3, 0.3, 200)
     mean = u.copy()
     mean[1:-1] = 0.7 * u[1:-1] + 0.15 * (u[2:] + u[:-2])
@@ -404,6 +392,12 @@ def test_smoothed_commands_are_means_with_their_neighbours(files):
     _, run = turning(files, u=u)
     np.testing.assert_allclose(run(option__smooth=0.3), plain(), atol=1e-12)
     assert np.abs(run() - plain()).max() > 1e-3
+    found, run = turning(files)
+    assert found.simulator.parameters["joint:turn.width"].effect == "command:u.backlash"
+    plain = run()
+    assert np.abs(run(joint_of_turn__width=1e-7) - plain).max() < 1e-3
+    apart = run(joint_of_turn__width=0.02) - plain
+    assert 3e-3 < np.abs(apart).max() < 0.06 and np.abs(run() - plain).max() == 0.0
 
 
 @pytest.mark.parametrize("seen", ["left", "right"])
@@ -493,8 +487,7 @@ def test_maps_of_a_urdf_leave_goals_to_their_user_and_say_what_cannot_be_asked(u
 @pytest.mark.parametrize(("name", "value", "stated"), [
     (None, None, ()), ("joint:left.armature", 0.5, ('armature="0.3"', 'armature="0.5"')),
     ("body:left.mass", 0.2, ('mass="0.1"', 'mass="0.2"')),
-    ("body:left.payload", 0.1, ('mass="0.1"', 'mass="0.2"')),
-])  # fmt: skip
+    ("body:left.payload", 0.1, ('mass="0.1"', 'mass="0.2"'))])  # fmt: skip
 def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, value, stated):
     finger = (
         '<body name="{0}" pos="0 {1} 0"><joint name="{0}" type="slide" axis="0 1 0" damping="6"'
@@ -504,8 +497,7 @@ def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, 
         '<mujoco><option timestep="0.001"/><worldbody>'
         + finger.format("left", 0.1, 0.3, 0.1) + finger.format("right", -0.1, 0.25, 0.15)
         + '</worldbody><equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality>'
-        '<actuator><position name="grip" joint="left" kp="400" kv="10"/></actuator></mujoco>'
-    )  # fmt: skip
+        '<actuator><position name="grip" joint="left" kp="400" kv="10"/></actuator></mujoco>')  # fmt: skip
     described = ('[columns.l]\njoint = "left"\n[columns.r]\njoint = "right"\n'
                  '[columns.u]\nactuator = "grip"\nunit = "m"\n')  # fmt: skip
     found, t = load_mjcf(*files(xml, described)), np.arange(0, 0.5, 0.001)
@@ -569,25 +561,6 @@ def test_a_payload_is_a_point_mass_where_it_is_said_to_be(files, place, at):
     _, other = turning(files, place + TURN, ball)
     np.testing.assert_allclose(run(body_of_arm__payload=0.3), other(), atol=1e-7)
     assert np.abs(run() - other()).max() > 1e-3
-
-
-def test_a_load_is_carried_by_the_tool_that_is_fixed_to_the_last_link(files):
-    """A sensor in the wrist feels it there, and not on the link."""
-    tool = '<body name="hand" pos="0.3 0 0"><geom size="0.01" mass="0.2" contype="0" conaffinity="0"/></body>'
-    offered = turning(files, TURN, tool)[0].simulator.parameters
-    assert {"body:arm.mass", "body:hand.mass", "body:hand.com_x", "body:hand.payload"} <= {*offered}
-    assert "body:arm.payload" not in offered
-    stated = turning(files, 'payload_at = {arm = "tool"}\n' + TURN, tool)[0].simulator.parameters
-    assert "body:arm.payload" in stated and "body:hand.payload" not in stated
-
-
-def test_no_play_is_the_plain_model_and_play_lags_at_turns(files):
-    found, run = turning(files)
-    assert found.simulator.parameters["joint:turn.width"].effect == "command:u.backlash"
-    plain = run()
-    assert np.abs(run(joint_of_turn__width=1e-7) - plain).max() < 1e-3
-    apart = run(joint_of_turn__width=0.02) - plain
-    assert 3e-3 < np.abs(apart).max() < 0.06 and np.abs(run() - plain).max() == 0.0
 
 
 def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(files):

@@ -81,6 +81,13 @@ def test_a_session_stacks_and_its_trial_identifies_the_blocks(session, tmp_path)
 
 
 def test_fingers_move_by_touches_through_springs_that_show_the_force_and_not_by_nonsense(session, tmp_path):
+    before = session.target.copy()
+    session.aim(float("nan"), 0.1, True)
+    session.touch(np.array([[np.inf, 0.0], [0.0, 0.0]]))
+    np.testing.assert_array_equal(session.target, before)
+    assert session.fingers is None
+    with pytest.raises(ValueError, match="less than a second"):
+        session.save(tmp_path)
     session.touch(np.array([[0.17, 0.04], [0.12, 0.05]]))
     session.advance(2000)
     np.testing.assert_allclose(session.nominal.position, [[0.12, 0.05], [0.17, 0.04]], atol=1e-3)
@@ -91,16 +98,9 @@ def test_fingers_move_by_touches_through_springs_that_show_the_force_and_not_by_
     assert session.nominal.force[0, 0] == pytest.approx(2.0, rel=0.05)
     stretch = session.command[0, 0] - session.nominal.position[0, 0]
     assert 450.0 * stretch == pytest.approx(2.0, rel=0.05)
-    before = session.target.copy()
-    session.aim(float("nan"), 0.1, True)
-    session.touch(np.array([[np.inf, 0.0], [0.0, 0.0]]))
-    np.testing.assert_array_equal(session.target, before)
-    assert session.fingers is None
-    with pytest.raises(ValueError, match="less than a second"):
-        session.save(tmp_path)
 
 
-def test_an_effect_beside_is_felt(session):
+def test_effects_beside_are_felt_and_a_diagnosis_names_them(session, tmp_path):
     session.compare_with(session.world_with({"force_gain": {"gain": 0.5}}))
     session.aim(session.x["block1"], 0.008, False)
     session.advance(1500)
@@ -110,6 +110,17 @@ def test_an_effect_beside_is_felt(session):
     assert other["force"][0][0] == pytest.approx(1.5 * nominal["force"][0][0], rel=1e-6)
     np.testing.assert_allclose(other["blocks"], nominal["blocks"], atol=1e-9)
     assert session.scene()["effects"] == {"force_gain": {"gain": 0.5}}
+    path = tmp_path / "d.json"
+    document = {"format": "hmmseg.diagnose/1", "verdict": "named", "causes": ["force_lowpass"],
+                "effects": {"force_lowpass": {"parameters": {"time_constant": {"mean": 0.04}}}}}  # fmt: skip
+    path.write_text(json.dumps(document))
+    assert diagnosed(path) == {"force_lowpass": {"time_constant": 0.04}}
+    path.write_text(json.dumps(document | {"causes": [], "verdict": "none"}))
+    refused("a diagnosis that names a cause", diagnosed, path)
+    path.write_text(json.dumps(document | {"causes": ["backlash"]}))
+    refused("backlash cannot be felt", diagnosed, path)
+    path.write_text(json.dumps({"format": "hmmseg.identify/1"}))
+    assert diagnosed(path) == {}
 
 
 def test_effects_change_the_scene_by_the_parameters_of_one_form_alone():
@@ -133,25 +144,10 @@ def test_every_offered_effect_can_be_felt(name):
     assert out.shape == force.shape and np.isfinite(out).all()
 
 
-def test_a_diagnosis_names_what_stands_beside(tmp_path):
-    path = tmp_path / "d.json"
-    document = {"format": "hmmseg.diagnose/1", "verdict": "named", "causes": ["force_lowpass"],
-                "effects": {"force_lowpass": {"parameters": {"time_constant": {"mean": 0.04}}}}}  # fmt: skip
-    path.write_text(json.dumps(document))
-    assert diagnosed(path) == {"force_lowpass": {"time_constant": 0.04}}
-    path.write_text(json.dumps(document | {"causes": [], "verdict": "none"}))
-    refused("a diagnosis that names a cause", diagnosed, path)
-    path.write_text(json.dumps(document | {"causes": ["backlash"]}))
-    refused("backlash cannot be felt", diagnosed, path)
-    path.write_text(json.dumps({"format": "hmmseg.identify/1"}))
-    assert diagnosed(path) == {}
-
-
 @pytest.mark.parametrize(("arguments", "line"), [
     (["nowhere.json"], "nowhere.json: no such file"),
     (["--effect", "gravity"], "effect gravity: cannot be felt in a played world"),
-    (["--rig", "nowhere.toml"], "nowhere.toml: no such file"),
-])  # fmt: skip
+    (["--rig", "nowhere.toml"], "nowhere.toml: no such file")])  # fmt: skip
 def test_bad_input_is_told_in_one_line(arguments, line, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["play", *arguments, "--no-open"]) == 2 and line in capsys.readouterr().err

@@ -50,23 +50,20 @@ def logs(count: int = 4) -> list[Recording]:
     return out
 
 
-def test_two_that_do_the_same_are_a_set_wherever_the_search_ended():
+def test_what_does_the_same_is_a_set_and_logs_of_one_group_are_held_out_together():
     found = diagnose(checked(Servo(), "servo"), logs())
     told = body(found)
     assert told["verdict"] == "set" and {*told["causes"], *told["indistinguishable"]} == {"band", "friction"}
     for name in ("band", "friction"):
         (width,) = told["effects"][name]["parameters"].values()
         assert abs(width["mean"] - WIDTH) < 0.2 * WIDTH, name
+    rows = object.__new__(Rows)
+    object.__setattr__(rows, "log", np.repeat(np.arange(4), 3))  # all that folds are made of
+    fold = folds_of(rows, 4, groups=[100, 200, 100, 200])
+    assert fold.tolist() == [0] * 3 + [1] * 3 + [0] * 3 + [1] * 3
 
 
 @pytest.mark.parametrize("groups", [[1, 2, 1], [4, 4]])
 def test_groups_that_nothing_can_be_held_out_by_are_refused(groups):
     with pytest.raises(InputError, match=r"groups: are \d in \d groups for 2 logs; expected"):
         diagnose(checked(Swing(), "Swing"), [log(1), log(2)], groups=groups)
-
-
-def test_logs_of_one_group_are_held_out_together():
-    rows = object.__new__(Rows)
-    object.__setattr__(rows, "log", np.repeat(np.arange(4), 3))  # all that folds are made of
-    fold = folds_of(rows, 4, groups=[100, 200, 100, 200])
-    assert fold.tolist() == [0] * 3 + [1] * 3 + [0] * 3 + [1] * 3

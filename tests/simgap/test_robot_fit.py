@@ -97,21 +97,20 @@ def test_what_is_settled_stays_and_lines_from_starts_hide_in_no_discrepancy(damp
     nothing = search.nothing()
     loud, quiet = (replace(nothing, discrepancy=d) for d in ({"angle": 1e3}, {}))
     assert search._begun_anew(loud, quiet)[2] > 2 * search._begun_anew(loud, loud)[2] > 0
+    search = Search(damped, tuple(damped.effects), damped.rows.log)
+    nothing = search.nothing()
     first = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
     assert first.score > nothing.score + 100
     again = search.fit(("viscous",), first.point, [first.whiten])
     assert abs(again.score - first.score) < BETTER
 
 
-def test_a_search_takes_fewer_windows_where_each_has_many_rows(damped, monkeypatch):
+def test_searches_thin_windows_of_many_rows_and_fit_rivals_to_the_end(damped, monkeypatch):
     every = damped.thinned()
     monkeypatch.setattr("simgap.robots.model.MOST_ROWS", -(-damped.rows.log.size // 2))
     assert damped.thinned() == every[::2]
     none = tuple(slice(0, 0) for _ in every)  # readings that are missing throughout
     assert replace(damped, rows=replace(damped.rows, of=none)).thinned() == every
-
-
-def test_rivals_are_fitted_to_the_end_before_they_are_ruled_out(damped, monkeypatch):
     search, again = Search(damped, tuple(damped.effects), damped.rows.log), []
     best = search.nothing()
     for name, score, promise in (("near", -4.0, -1.0), ("far", -9.0, -4.0), ("settled", -2.0, -2.0)):

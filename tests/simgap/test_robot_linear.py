@@ -132,13 +132,18 @@ def test_a_reading_s_past_is_undone_from_the_samples_that_are_there(name, value)
     assert np.isnan(undone[1::2]).all()
 
 
-def test_lowpass_of_a_ramp_and_of_a_sine():
+def test_lowpass_resolution_and_noise_are_as_planted():
     t = np.linspace(0, 3, 3001)
     np.testing.assert_allclose(lowpass(t, 2 * t + 1, 0.1), 2 * (t - 0.1) + 1, atol=1e-12)
     w, tau = 2 * np.pi, 0.05
     found = lowpass(t, np.sin(w * t), tau)
     exact = np.imag(np.exp(1j * w * t) / (1 + 1j * w * tau))
     np.testing.assert_allclose(found[1000:], exact[1000:], atol=1e-5)
+    values = np.random.default_rng(0).standard_normal(500)
+    assert resolution(values) < 1e-4 and resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
+    log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
+    assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
+    assert estimate_noise([log.window(0, 2)], "z") == 1.0
 
 
 def test_what_only_acts_together_is_said():
@@ -152,14 +157,6 @@ def test_what_only_acts_together_is_said():
     assert any(a.own < 1e-3 and set(a.names) == set(names) for a in found.alike)
     kept = [k for k, n in enumerate(names) if n != "torque_scale"]
     assert not identifiability([names[k] for k in kept], columns[:, kept].T @ columns[:, kept]).alike
-
-
-def test_resolution_and_noise_are_told_only_where_there_are_any():
-    values = np.random.default_rng(0).standard_normal(500)
-    assert resolution(values) < 1e-4 and resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
-    log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
-    assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
-    assert estimate_noise([log.window(0, 2)], "z") == 1.0
 
 
 def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():

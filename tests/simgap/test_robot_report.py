@@ -54,7 +54,7 @@ def test_a_history_that_is_none_names_its_line(tmp_path, line):
         history(file)
 
 
-def test_what_was_named_stands_over_what_was_calibrated_and_of_a_set_nothing_is_told():
+def test_what_was_named_stands_over_what_was_calibrated_and_a_model_that_flies_off_is_a_line():
     body = {"verdict": "named", "causes": ["joint:a.f"], "indistinguishable": [],
             "effects": {"joint:a.f": {"parameters": {"f": told(2.0)}},
                         "s": {"parameters": {"v": told(1.0), "w": told(4.0)}}},
@@ -62,6 +62,10 @@ def test_what_was_named_stands_over_what_was_calibrated_and_of_a_set_nothing_is_
     assert {n: p["mean"] for n, p in intervals(body).items()} == {"joint:a.f": 2.0, "g": 3.0}
     found = intervals(body | {"verdict": "set", "indistinguishable": ["s"]})
     assert {n: p["mean"] for n, p in found.items()} == {"joint:a.f": None, "g": 3.0, "s.v": None, "s.w": None}
+    with (Output("diagnose", quiet=True) as out,
+          pytest.raises(InputError, match="runs far away from the logs"),
+          show_stages(out, "diagnosing", 1)):  # fmt: skip
+        np.linalg.cholesky(-np.eye(2))
 
 
 def test_motions_are_written_as_logs_have_them_and_pages_in_their_units():
@@ -93,13 +97,6 @@ def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
     assert [e for e, *_ in sent] == [f"a.csv/q/{n}" for n in ("recorded", "simulated", "corrected")]
     assert [list(v) for _, _, v in sent] == [[0, 1], [1, 2], [2, 3]]
     assert all(list(index) == [0, 1] for _, index, _ in sent)
-
-
-def test_a_model_that_flies_off_is_one_line():
-    with (Output("diagnose", quiet=True) as out,
-          pytest.raises(InputError, match="runs far away from the logs"),
-          show_stages(out, "diagnosing", 1)):  # fmt: skip
-        np.linalg.cholesky(-np.eye(2))
 
 
 @pytest.mark.parametrize(("options", "line"), [

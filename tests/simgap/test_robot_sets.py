@@ -141,12 +141,16 @@ def test_starts_are_taken_from_residuals_and_noise_leaves_the_floor():
     assert np.isnan(cov.without_starts(cov.whitener(), np.where(moved > 9, moved, np.nan))).all()
 
 
-def test_a_value_at_a_bound_is_doubted_but_for_nothing_at_all():
+def test_values_at_bounds_and_logs_that_disagree_are_doubted():
     known = {"rubs": RobotEffect("rubs", "", {"loss": Parameter(0.02, 0.01, "N m", low=0.0)}),
              "weighs": RobotEffect("weighs", "", {"mass": Parameter(1.0, 0.1, "kg", low=0.3)})}  # fmt: skip
     best = SimpleNamespace(point={"rubs": {"loss": 0.0}, "weighs": {"mass": 0.3}})
     assert _absurd(known, best, ["rubs"]) == ()  # type: ignore[arg-type]
     assert _absurd(known, best, ["rubs", "weighs"]) == ("weighs mass 0.3 kg is no value of a robot's",)  # type: ignore[arg-type]
+    assert predicts_better(np.array([0.5, 0.6, 0.5, 0.4, 0.5, 0.6]))  # little, but in every log
+    assert predicts_better(np.array([9.0, 370.0, 21.0]))  # much, and in one log far more
+    assert not predicts_better(np.array([0.3, 37.0, -8.7]))  # one log is predicted worse
+    assert not predicts_better(np.array([0.3, 370.0, 0.2]))  # one log alone says so
 
 
 @pytest.mark.parametrize("folds", [2, 3, 6])
@@ -155,13 +159,6 @@ def test_a_set_predicts_better_by_chance_as_rarely_as_it_says(folds: int, sd: fl
     # of two normal densities that are sd apart, the log ratio where the rival is right
     gains = np.random.default_rng(0).normal(-0.5 * sd**2, sd, (4000, folds))
     assert np.mean([predicts_better(g) for g in gains]) < 0.06
-
-
-def test_a_set_predicts_better_only_where_logs_agree():
-    assert predicts_better(np.array([0.5, 0.6, 0.5, 0.4, 0.5, 0.6]))  # little, but in every log
-    assert predicts_better(np.array([9.0, 370.0, 21.0]))  # much, and in one log far more
-    assert not predicts_better(np.array([0.3, 37.0, -8.7]))  # one log is predicted worse
-    assert not predicts_better(np.array([0.3, 370.0, 0.2]))  # one log alone says so
 
 
 def test_log_odds_count_less_where_residuals_vary_more_than_their_discrepancy():

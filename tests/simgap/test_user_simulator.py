@@ -38,6 +38,7 @@ def run(parameters, recording, start=None):
     %s
 run.parameters, run.channels, run.timeout = parameters, channels, 0.5
 """
+LOG = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
 
 
 @pytest.fixture
@@ -57,11 +58,17 @@ def test_classes_objects_and_functions_will_do(file, name, restarted):
     assert simulator.parameters["slope"].sd == 0.1 and simulator.channels["u"].kind == "command"
 
 
-def test_a_run_that_diverges_is_none(file):
+def test_runs_may_diverge_or_be_interrupted_and_what_is_alike_will_do(file):
     simulator = load_simulator(f"{file()}:open_loop")
     log = Recording("a.csv", np.arange(3.0), {"u": np.ones(3)})
     found = run_all(simulator, [Job({"slope": 2.0}, log, None), Job({"slope": np.inf}, log, None)])
     assert found[0] is not None and found[0]["y"].tolist() == [2.0, 2.0, 2.0] and found[1] is None
+    with pytest.raises(KeyboardInterrupt):
+        load_simulator(f"{file(RUN % 'raise KeyboardInterrupt')}:run").simulate({}, LOG)
+    for good in ("[1, 2, True]", "recording.t.astype(np.float32)", "np.array([1, 2, 3], object)"):
+        code = f"return {{'y': {good}, 'more': 'text'}}"
+        found = load_simulator(f"{file(RUN % code)}:run").simulate({}, LOG)
+        assert found["y"].dtype == float and list(found) == ["y"]
 
 
 @pytest.mark.parametrize(("name", "text", "line"), [
@@ -106,9 +113,8 @@ def test_what_is_wrong_is_said_in_a_line(file, name, text, line):
 ])  # fmt: skip
 def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, line):
     simulator = load_simulator(f"{file(RUN % code)}:run")
-    log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
-    caught = refused(line, run_all, simulator, [Job({"slope": 2.0}, log, None)])
-    assert "\n" not in caught and log.t[0] == 0
+    refused(line, run_all, simulator, [Job({"slope": 2.0}, LOG, None)])
+    assert LOG.t[0] == 0
 
 
 @pytest.mark.parametrize(("name", "code", "line"), [
@@ -118,24 +124,12 @@ def test_whatever_a_run_does_is_said_in_a_line_that_names_its_place(file, code, 
     ("state_at", "return {'y': 1.0}", r"expected \{state: \(value, standard deviation\)\}"),
     ("state_at", "return {'y': (float('nan'), 1.0)}", "state y: nan with standard dev"),
     ("contacts", "return None", r"gave None; expected times \[s\] in one row"),
-    ("contacts", "exit(3)", "line 10: SystemExit: 3"),
-])  # fmt: skip
+    ("contacts", "exit(3)", "line 10: SystemExit: 3")])  # fmt: skip
 def test_what_else_a_simulator_offers_is_checked_alike(file, name, code, line):
     text = RUN % "return {'y': recording.t}" + f"def more(*args):\n    {code}\nrun.{name} = more\n"
     simulator = load_simulator(f"{file(text)}:run")
-    log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
-    given = {"simulate_many": ([Job({"slope": 2.0}, log, None)],), "state_at": (log, 0.0), "contacts": (log,)}
+    given = {"simulate_many": ([Job({"slope": 2.0}, LOG, None)],), "state_at": (LOG, 0.0), "contacts": (LOG,)}
     refused(line, getattr(simulator, name), *given[name])
-
-
-def test_an_interrupt_stays_one_and_what_is_alike_will_do(file):
-    log = Recording("a.csv", np.arange(3.0), {"y": np.ones(3)})
-    with pytest.raises(KeyboardInterrupt):
-        load_simulator(f"{file(RUN % 'raise KeyboardInterrupt')}:run").simulate({}, log)
-    for good in ("[1, 2, True]", "recording.t.astype(np.float32)", "np.array([1, 2, 3], object)"):
-        code = f"return {{'y': {good}, 'more': 'text'}}"
-        found = load_simulator(f"{file(RUN % code)}:run").simulate({}, log)
-        assert found["y"].dtype == float and list(found) == ["y"]
 
 
 def test_a_file_is_read_by_its_own_name_whatever_it_is_called(tmp_path):

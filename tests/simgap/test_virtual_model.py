@@ -179,12 +179,18 @@ def test_a_trial_shows_its_task_its_widths_and_heights_and_the_rig_s_noise(stack
     assert np.std(noise) == pytest.approx(2e-4 * 0.12, rel=0.1)
 
 
-def test_a_seed_gives_one_trial_and_another_seed_another(stacked):
+def test_a_seed_gives_one_trial_in_which_a_slide_moves_its_block_along_the_ground(stacked):
     again = simulate_trials(STACK, RIG, [PAPER_BLOCKS], [3])[0]
     np.testing.assert_array_equal(again.trial.channels["fx1"], stacked.trial.channels["fx1"])
     together = simulate_trials(STACK, RIG, [PAPER_BLOCKS] * 3, [4, 3, 5])
     np.testing.assert_allclose(together[1].motion.force, stacked.motion.force, atol=1e-9)
     assert abs(together[0].boundaries - together[2].boundaries).max() > 0.05
+    done = simulate_trials(SLIDE, RIG, [random_properties(SLIDE, 2)], [2])[0]
+    start, stop = done.boundaries[1:3]
+    x, y = done.motion.blocks[:, 0, 0], done.motion.blocks[:, 0, 1]
+    before, after = (x[np.searchsorted(done.t, time)] for time in (start, stop))
+    assert abs(after - before) > 0.02 and abs(before - x[0]) < 1e-3
+    assert np.ptp(y[: np.searchsorted(done.t, done.boundaries[3])]) < 1e-4
 
 
 @pytest.mark.parametrize("task", [TOWER, SLIDE])
@@ -199,15 +205,6 @@ def test_any_task_ends_as_described(task):
         assert y[name] - blocks[name].height / 2 == pytest.approx(floor, abs=3e-5)
         if on != GROUND:
             assert abs(x[name] - x[on]) < 3e-3
-
-
-def test_a_slide_moves_the_block_along_the_ground_between_its_boundaries():
-    done = simulate_trials(SLIDE, RIG, [random_properties(SLIDE, 2)], [2])[0]
-    start, stop = done.boundaries[1:3]
-    x, y = done.motion.blocks[:, 0, 0], done.motion.blocks[:, 0, 1]
-    before, after = (x[np.searchsorted(done.t, time)] for time in (start, stop))
-    assert abs(after - before) > 0.02 and abs(before - x[0]) < 1e-3
-    assert np.ptp(y[: np.searchsorted(done.t, done.boundaries[3])]) < 1e-4
 
 
 def test_what_cannot_be_performed_or_held_is_no_silent_success():
