@@ -86,12 +86,12 @@ def test_bad_recordings_folders_and_plain_sequences_are_told_in_a_line(lab, capf
     (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')
     assert main(["segment", "many", "--task", "order.toml", "--workers", "2"]) == 2
     assert "go with tasks of blocks alone" in capfd.readouterr().err
+    ((pile := tmp_path / "pile") / "inner").mkdir(parents=True)
     for name in ("b.csv", "a.CSV", "rig.toml", "c.npz"):
-        (tmp_path / name).touch()
-    (tmp_path / "inner").mkdir()
-    found = recordings_in([tmp_path / "b.csv", tmp_path])
+        (pile / name).touch()
+    found = recordings_in([pile / "b.csv", pile])
     assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
-    refused("no recordings in this folder", recordings_in, [tmp_path / "inner"])
+    refused("no recordings in this folder", recordings_in, [pile / "inner"])
 
 
 @pytest.mark.parametrize(("more", "said"), [
