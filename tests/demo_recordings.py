@@ -15,7 +15,6 @@ def recorded(folder: Path | str, count: int) -> tuple[list[Trial], BlockTask, Ri
     """The first trials of a folder (of recordings/, if a name), their task and rig."""
     folder = RECORDINGS / folder
     rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    assert isinstance(task, BlockTask)
     return [read_trial(folder / f"trial_{k:02d}.csv", rig) for k in range(1, count + 1)], task, rig
 
 

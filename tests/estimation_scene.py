@@ -14,16 +14,20 @@ SD = np.array([4e-3, 5e-6, 1e-5])  # of one mean, by channel
 UNIT = np.array([0.5, 1.4e-3, 8e-5])  # what shares of model error are taken of
 
 
+def ar1(num, length, rho, rng):
+    """Series (num, length) of unit variance with autocorrelation rho^lag."""
+    out = rng.normal(size=(num, length))
+    for k in range(1, length):
+        out[:, k] = rho * out[:, k - 1] + np.sqrt(1 - rho**2) * out[:, k]
+    return out
+
+
 def _unread(trial, rig, size):
     raise AssertionError("designs made here are complete")
 
 
 def make_design(num_trials=4, seed=0, deviations=0, objects=OBJECTS, count=40.0):
-    """Design of one grip a trial for each object, its means still to be drawn (`drawn`).
-
-    `deviations` (at most 2): a bias of the force that free motion sees, and a shift of the width
-    that nothing else sees.
-    """
+    """A grip a trial for each object; deviations: a bias that free motion sees, a shift of widths."""
     rng = np.random.default_rng(seed)
     unknowns = tuple(Unknown(prop, {obj: 1}) for obj in objects for prop in PROPS)
     rows = [(t, m, c) for t in range(num_trials) for m in range(len(objects)) for c in range(3)]
@@ -38,23 +42,17 @@ def make_design(num_trials=4, seed=0, deviations=0, objects=OBJECTS, count=40.0)
         shifts[channel == 0, 0], free_shifts[:, 1, 0] = 0.02, 0.02
     if deviations > 1:
         shifts[channel == 1, 1] = 3e-5
-    return Design(
-        unknowns=unknowns,
-        nuisances=tuple(Nuisance(f"deviation.{i}", 1.0, 1.0, _unread) for i in range(deviations)),
-        mean=np.zeros(len(rows)), variance=SD[channel] ** 2 * rng.uniform(0.5, 2.0, size=len(rows)),
-        coefficients=coefficients, shifts=shifts, channel=channel, unit=unit, trial=trial, move=move,
-        slope=np.zeros(len(rows), bool),
-        free_mean=np.zeros((num_trials, 4)), free_variance=np.full((num_trials, 4), 2e-3**2),
-        free_shifts=free_shifts, scale_count=np.full(3, count),
-    )  # fmt: skip
+    return Design(unknowns=unknowns,
+                  nuisances=tuple(Nuisance(f"deviation.{i}", 1.0, 1.0, _unread) for i in range(deviations)),
+                  mean=np.zeros(len(rows)), variance=SD[channel] ** 2 * rng.uniform(0.5, 2.0, size=len(rows)),
+                  coefficients=coefficients, shifts=shifts, channel=channel, unit=unit, trial=trial,
+                  move=move, slope=np.zeros(len(rows), bool), free_mean=np.zeros((num_trials, 4)),
+                  free_variance=np.full((num_trials, 4), 2e-3**2), free_shifts=free_shifts,
+                  scale_count=np.full(3, count))  # fmt: skip
 
 
 def drawn(design, seed, properties=None, scales=None):
-    """The design with data drawn from the model it stands for, and what they were drawn of.
-
-    (design, unknowns (Q,), scales (6,), deviations (N,)); scales come from their prior unless given,
-    as does everything else but the unknowns, TRUE unless given.
-    """
+    """The design with data drawn, unknowns (Q,), scales (6,), deviations (N,), of priors if not given."""
     rng = np.random.default_rng([seed, 99])
     d, sd = design, 1 / np.sqrt(2 * design.scale_count)
     if scales is None:

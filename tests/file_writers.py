@@ -14,16 +14,16 @@ from rosbags.rosbag2 import Writer as Bag2
 from rosbags.typesys import Stores, get_typestore
 
 DELAY = 300_000  # ns: a message is logged a little later than its stamp
+WRENCH, POSE = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/PoseStamped"
+START = 1_764_000_000_000_000_000  # ns since 1970
+FAST = np.arange(200) * 10_000_000  # 100 Hz, of the wrenches
+SLOW = np.arange(41) * 50_000_000 - 7_000_000  # 20 Hz, of the poses
+ODD_START = 1_764_000_000_123_456_789  # ns since 1970
 
 
 @dataclass(frozen=True)
 class Topic:
-    """Messages of one kind at times [ns since 1970] (num_messages,).
-
-    `values` by field: of a wrench and a pose `force`, `torque`, `position` (num_messages, 3), what is absent
-    zero; of a JointState columns by the joints' names in `position` and `velocity`; of a Float64 `data`
-    (num_messages,), which has no stamp.
-    """
+    """Messages of a kind at times [ns since 1970] (num_messages,); `values` by field, what is absent zero."""
 
     name: str
     kind: str
@@ -89,14 +89,7 @@ def _ordered(topics: list[Topic]) -> list[tuple[Topic, int]]:
     return [(topics[number], k) for _, number, k in sorted(every)]
 
 
-WRENCH, POSE = "geometry_msgs/msg/WrenchStamped", "geometry_msgs/msg/PoseStamped"
-START = 1_764_000_000_000_000_000  # ns since 1970
-FAST = np.arange(200) * 10_000_000  # 100 Hz, of the wrenches
-SLOW = np.arange(41) * 50_000_000 - 7_000_000  # 20 Hz, of the poses
-
-
 def force(ns):
-    """The planted wrench's x [N] at times since the start [ns]."""
     return 2 + np.sin(np.asarray(ns) * 1e-9)
 
 
@@ -106,7 +99,6 @@ def height(ns):
 
 
 def joint(ns):
-    """The planted second joint [rad]."""
     return -1.0 + 0.3 * np.asarray(ns) * 1e-9
 
 
@@ -117,43 +109,28 @@ def planted(gap: tuple[int, int] = (0, 0)) -> list[Topic]:
     still = 0.0 * slow
     joints = {"position": {"a": still + 0.5, "b": joint(slow)}, "velocity": {"a": still, "b": still + 0.3}}
     place = np.stack([still, still, height(slow)], axis=1)
-    return [
-        Topic("/wrench", WRENCH, START + FAST,
-              {"force": push, "torque": np.tile([0.0, 0.0, 0.1], (FAST.size, 1))}),
-        Topic("/opening", "std_msgs/msg/Float64", START + FAST, {"data": np.full(FAST.size, 0.06)}),
-        Topic("/joints", "sensor_msgs/msg/JointState", START + slow, joints),
-        Topic("/pose", POSE, START + slow, {"position": place}),
-    ]  # fmt: skip
-
-
-def write_mcap(path: Path, gap: tuple[int, int] = (0, 0)) -> Path:
-    """The planted topics in an MCAP log."""
-    return mcap_of(path, planted(gap))
-
-
-def write_bag(path: Path) -> Path:
-    """The same, in a ROS 1 bag (.bag) or a ROS 2 bag (a folder)."""
-    return bag_of(path, planted())
+    return [Topic("/wrench", WRENCH, START + FAST,
+                  {"force": push, "torque": np.tile([0.0, 0.0, 0.1], (FAST.size, 1))}),
+            Topic("/opening", "std_msgs/msg/Float64", START + FAST, {"data": np.full(FAST.size, 0.06)}),
+            Topic("/joints", "sensor_msgs/msg/JointState", START + slow, joints),
+            Topic("/pose", POSE, START + slow, {"position": place})]  # fmt: skip
 
 
 def write_robomimic(path: Path, demos: int = 2) -> Path:
     """Demonstrations as robomimic lays them out, 20 Hz, images among them."""
     steps = np.arange(50.0)
     place = [np.stack([steps * 0.01, 0 * steps, 0 * steps + k], axis=1) for k in range(demos)]
-    return robomimic_of(path, 20, [
-        {"actions": np.full((50, 7), k), "obs/robot0_eef_pos": place[k],
-         "obs/agentview_image": np.zeros((50, 8, 8, 3), dtype=np.uint8)}
-        for k in range(demos)
-    ])  # fmt: skip
+    return robomimic_of(path, 20, [{"actions": np.full((50, 7), k), "obs/robot0_eef_pos": place[k],
+                                    "obs/agentview_image": np.zeros((50, 8, 8, 3), dtype=np.uint8)}
+                                   for k in range(demos)])  # fmt: skip
 
 
 def robomimic_of(path: Path, rate: int, demos: list[dict[str, np.ndarray]]) -> Path:
     """Demonstrations of these data sets by their place below the demonstration."""
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
-        data.attrs["env_args"] = json.dumps(
-            {"env_name": "Lift", "type": 1, "env_kwargs": {"control_freq": rate}}
-        )
+        data.attrs["env_args"] = json.dumps({"env_name": "Lift", "type": 1,
+                                             "env_kwargs": {"control_freq": rate}})  # fmt: skip
         data.attrs["total"] = sum(len(next(iter(demo.values()))) for demo in demos)
         for k, columns in enumerate(demos):
             demo = data.create_group(f"demo_{k}")
@@ -172,26 +149,19 @@ def write_lerobot(folder: Path, version: int = 3, episodes: int = 3) -> Path:
 
 def lerobot_of(folder: Path, version: int, fps: int, names: list[str], states: list[np.ndarray],
                actions: list[np.ndarray]) -> Path:  # fmt: skip
-    """A data set as LeRobot lays it out: a file an episode (2), or all in one (3).
-
-    `states` of each episode (num_timesteps, num_names), `actions` (num_timesteps, 2).
-    """
+    """A data set as LeRobot has it, a file an episode (2) or all in one (3)."""
     (folder / "meta").mkdir(parents=True)
     (folder / "data/chunk-000").mkdir(parents=True)
     name = "episode_{episode_index:06d}" if version == 2 else "file-{file_index:03d}"
     lengths = [len(state) for state in states]
-    info = {
-        "codebase_version": "v2.1" if version == 2 else "v3.0", "fps": fps, "total_episodes": len(states),
-        "total_frames": sum(lengths), "chunks_size": 1000,
-        "data_path": f"data/chunk-{{chunk_index:03d}}/{name}.parquet",
-        "features": {
-            "observation.state": {"dtype": "float32", "shape": [len(names)], "names": names},
-            "action": {"dtype": "float32", "shape": [2], "names": {"motors": ["a", "b"]}},
-            "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-            "frame_index": {"dtype": "int64", "shape": [1], "names": None},
-            "episode_index": {"dtype": "int64", "shape": [1], "names": None},
-        },
-    }  # fmt: skip
+    info = {"codebase_version": "v2.1" if version == 2 else "v3.0", "fps": fps, "total_episodes": len(states),
+            "total_frames": sum(lengths), "chunks_size": 1000,
+            "data_path": f"data/chunk-{{chunk_index:03d}}/{name}.parquet",
+            "features": {"observation.state": {"dtype": "float32", "shape": [len(names)], "names": names},
+                         "action": {"dtype": "float32", "shape": [2], "names": {"motors": ["a", "b"]}},
+                         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+                         "frame_index": {"dtype": "int64", "shape": [1], "names": None},
+                         "episode_index": {"dtype": "int64", "shape": [1], "names": None}}}  # fmt: skip
     (folder / "meta/info.json").write_text(json.dumps(info))
     tables = []
     for k, (state, action, n) in enumerate(zip(states, actions, lengths, strict=True)):
@@ -215,14 +185,8 @@ def lerobot_of(folder: Path, version: int, fps: int, names: list[str], states: l
     return folder
 
 
-ODD_START = 1_764_000_000_123_456_789  # ns since 1970
-
-
 def finger_topics(c: dict[str, np.ndarray]) -> list[Topic]:
-    """Two fingertips that close along y and lift along z: poses twice as often as wrenches.
-
-    `c`: columns t, x1, y1, fx1, fy1, x2, y2, fx2, fy2 (num_timesteps,).
-    """
+    """Two fingertips that close along y and lift along z: poses twice as often as wrenches."""
     t, twice = c["t"], np.sort(np.r_[c["t"], (c["t"][1:] + c["t"][:-1]) / 2])
     out = []
     for side, i in (("left", 1), ("right", 2)):
@@ -235,26 +199,20 @@ def finger_topics(c: dict[str, np.ndarray]) -> list[Topic]:
 
 
 def wrist_topics(c: dict[str, np.ndarray], joints: int = 1) -> list[Topic]:
-    """An arm's pose and wrench on the recording's clock, a gripper's fingers at every `joints`-th time of it.
-
-    `c`: columns t, width, ee_y, ee_z, Fx to Tz (num_timesteps,).
-    """
+    """An arm's pose and wrench on the recording's clock, fingers at every `joints`-th time of it."""
     t, half = c["t"], c["width"][::joints] / 2
     fingers = {"panda_finger_joint1": half, "panda_finger_joint2": half}
     still = {name: 0 * half for name in fingers}
     wrench = {name: np.stack([c[f"{letter}{axis}"] for axis in "xyz"], axis=1)
               for name, letter in (("force", "F"), ("torque", "T"))}  # fmt: skip
     place = np.stack([0 * t + 0.5, c["ee_y"], c["ee_z"]], axis=1)
-    return [
-        Topic("/franka/ee_pose", POSE, stamps(t), {"position": place}),
-        Topic("/ft_sensor/wrench", WRENCH, stamps(t), wrench),
-        Topic("/franka_gripper/joint_states", "sensor_msgs/msg/JointState", stamps(t[::joints]),
-              {"position": fingers, "velocity": still}),
-    ]  # fmt: skip
+    return [Topic("/franka/ee_pose", POSE, stamps(t), {"position": place}),
+            Topic("/ft_sensor/wrench", WRENCH, stamps(t), wrench),
+            Topic("/franka_gripper/joint_states", "sensor_msgs/msg/JointState", stamps(t[::joints]),
+                  {"position": fingers, "velocity": still})]  # fmt: skip
 
 
 def stamps(t: np.ndarray) -> np.ndarray:
-    """Times [s] (num_timesteps,) as ns since 1970."""
     return ODD_START + np.round(t * 1e9).astype(np.int64)
 
 
@@ -270,29 +228,22 @@ def finger_columns(c: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def finger_vectors(c: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The same as vectors (num_timesteps, 3) of observations that close along y."""
     still = 0 * c["t"]
-    return {
-        f"obs/{side}_fingertip_{name}": np.stack([still, c[f"{letter}x{i}"], c[f"{letter}y{i}"]], axis=1)
-        for side, i in (("left", 1), ("right", 2))
-        for name, letter in (("pos", ""), ("force", "f"))
-    }
+    return {f"obs/{side}_fingertip_{name}": np.stack([still, c[f"{letter}x{i}"], c[f"{letter}y{i}"]], axis=1)
+            for side, i in (("left", 1), ("right", 2))
+            for name, letter in (("pos", ""), ("force", "f"))}  # fmt: skip
 
 
 def wrist_vectors(c: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A wrist as robosuite's observations: finger joints that count opposite ways."""
     still, half = 0 * c["t"], c["width"] / 2
-    return {
-        "obs/robot0_eef_pos": np.stack([still + 0.5, c["ee_y"], c["ee_z"]], axis=1),
-        "obs/robot0_gripper_qpos": np.stack([half, -half], axis=1),
-        "obs/robot0_ee_force": np.stack([c["Fx"], c["Fy"], c["Fz"]], axis=1),
-        "obs/robot0_ee_torque": np.stack([c["Tx"], c["Ty"], c["Tz"]], axis=1),
-    }
+    return {"obs/robot0_eef_pos": np.stack([still + 0.5, c["ee_y"], c["ee_z"]], axis=1),
+            "obs/robot0_gripper_qpos": np.stack([half, -half], axis=1),
+            "obs/robot0_ee_force": np.stack([c["Fx"], c["Fy"], c["Fz"]], axis=1),
+            "obs/robot0_ee_torque": np.stack([c["Tx"], c["Ty"], c["Tz"]], axis=1)}  # fmt: skip
 
 
 def german(columns: dict[str, np.ndarray], names: dict[str, tuple[str, float]]) -> bytes:
-    """A spreadsheet's CSV: semicolons, decimal commas, remarks with umlauts, ISO stamps.
-
-    `names`: theirs and how many of their units are one of ours, by column.
-    """
+    """A spreadsheet's CSV; `names`: theirs and how many of their units are one of ours, by column."""
     start = np.datetime64("2026-03-02T10:15:30.250000")
     rows = ["# Prüfstand 3, Messung vom 2.3.2026", "% Greifer mit Schaumbelägen"]
     rows.append(";".join(["Zeitstempel", *(theirs for theirs, _ in names.values())]))

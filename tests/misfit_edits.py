@@ -1,9 +1,4 @@
-"""Trials that do not fit their task, made by editing trials that do.
-
-Every edit takes a trial and its true boundaries [s] between the nine subtasks of the paper's task,
-and gives the edited trial with the index of the first subtask that it does not show. Pieces are
-joined with continuous time; positions jump where pieces meet, as they would under a cut.
-"""
+"""Trials that do not fit their task: edits give the trial and the index of the first subtask not shown."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -22,6 +17,7 @@ TRUTH = [json.loads((STACK / f"trial_0{i}.json").read_text())["boundaries"] for 
 
 Edit = Callable[[Trial, Sequence[float]], tuple[Trial, int]]
 FORCES = ("fx1", "fy1", "fx2", "fy2")
+END = np.inf
 
 
 def join(trial: Trial, *pieces: tuple[float, float]) -> Trial:
@@ -43,7 +39,6 @@ def let_go(trial: Trial, boundaries: Sequence[float], start: float, end: float) 
     return Trial(trial.file, trial.t, channels)
 
 
-END = np.inf
 EDITS: dict[str, Edit] = {
     # Block 1 falls in mid-carry, and nothing is held from there on, or block 2 is moved all the same.
     "drop_first": lambda t, b: (let_go(t, b, (b[1] + b[2]) / 2, END), 3),
@@ -74,8 +69,7 @@ EDITS: dict[str, Edit] = {
     "stops_in_carry": lambda t, b: (join(t, (-END, (b[5] + b[6]) / 2)), 7),
     "stops_in_first_pickup": lambda t, b: (join(t, (-END, b[0] + 0.3)), 2),
     # Block 2 is moved before block 1.
-    "swapped": lambda t, b: (join(t, ((b[3] + b[4]) / 2, END), (-END, (b[3] + b[4]) / 2)), 1),
-}  # fmt: skip
+    "swapped": lambda t, b: (join(t, ((b[3] + b[4]) / 2, END), (-END, (b[3] + b[4]) / 2)), 1)}  # fmt: skip
 
 
 def _concatenate(one: Trial, first: tuple[float, float], other: Trial, second: tuple[float, float]) -> Trial:

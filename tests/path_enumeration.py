@@ -8,9 +8,8 @@ import numpy as np
 def random_problem(num_timesteps, num_subtasks, seed=0, num_skips=0):
     rng = np.random.default_rng(seed)
     ll = rng.normal(size=(num_timesteps, num_subtasks)) * 2
-    bands = tuple(
-        rng.normal(size=(num_timesteps - 1, max(num_subtasks - d, 0))) - d for d in range(2 + num_skips)
-    )
+    bands = tuple(rng.normal(size=(num_timesteps - 1, max(num_subtasks - d, 0))) - d
+                  for d in range(2 + num_skips))  # fmt: skip
     return ll, bands
 
 
@@ -40,6 +39,5 @@ def brute(ll, bands, **ends):
     moves = [
         np.array([[p[(paths[:, t] == k) & (paths[:, t + 1] == k + d)].sum() for k in range(ll.shape[1] - d)]
                   for t in range(len(ll) - 1)]).reshape(len(ll) - 1, max(ll.shape[1] - d, 0))
-        for d in range(1, len(bands))
-    ]  # fmt: skip
+        for d in range(1, len(bands))]  # fmt: skip
     return paths, weights, log_evidence, smoothed, moves

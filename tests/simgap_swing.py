@@ -36,12 +36,10 @@ class Swing:
         return {"angle": out}
 
 
-def log(
-    seed: int, seconds: float = 6.0, rate: float = 100.0, noise: float = 5e-4, **changed: float
-) -> Recording:
+def log(seed: int, seconds: float = 6.0, rate: float = 100.0, noise: float = 5e-4,
+        **changed: float) -> Recording:  # fmt: skip
     """A recording of a Swing with some parameters changed."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(0.0, seconds, 1 / rate)
+    rng, t = np.random.default_rng(seed), np.arange(0.0, seconds, 1 / rate)
     waves = rng.uniform(0.2, 1.5, 4), rng.uniform(0, 2 * np.pi, 4)
     torque = 0.15 * np.sin(2 * np.pi * waves[0] * t[:, None] + waves[1]).sum(1)
     robot = Swing()

@@ -1,9 +1,4 @@
-"""Examples run: docstrings of what is public, and the pages of docs/ and README.md.
-
-On a page, blocks marked `python` run in order in one namespace, and lines `$ hmmseg ...` of blocks marked
-`console` run as the command would, in a folder that holds the recordings that come along. A comment
-`<!-- not run: why -->` before a block leaves it out. Pages that take long are marked slow.
-"""
+"""Examples run: docstrings, and blocks `python` and `console` of pages unless a comment says `not run`."""
 
 import doctest
 import importlib
@@ -24,17 +19,14 @@ BLOCK = re.compile(r"(<!-- not run[^>]*-->\s*)?^```(python|console)\n(.*?)^```$"
 
 
 def blocks(text: str) -> list[tuple[str, str]]:
-    """Language and content of the blocks to run."""
     return [(m[2], m[3]) for m in BLOCK.finditer(text) if not m[1]]
 
 
 def pages() -> list:
     found = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     with_examples = [path for path in found if blocks(path.read_text(encoding="utf-8"))]
-    return [
-        pytest.param(path, id=path.name, marks=[pytest.mark.slow] if path.name in SLOW else [])
-        for path in with_examples
-    ]
+    return [pytest.param(path, id=path.name, marks=[pytest.mark.slow] if path.name in SLOW else [])
+            for path in with_examples]  # fmt: skip
 
 
 def expanded(words: list[str]) -> list[str]:
@@ -49,8 +41,7 @@ def expanded(words: list[str]) -> list[str]:
 def test_docstrings(name):
     module = importlib.import_module(name)
     done = doctest.testmod(module, optionflags=doctest.ELLIPSIS)
-    assert done.attempted > 0
-    assert done.failed == 0
+    assert done.attempted > 0 and done.failed == 0
 
 
 @pytest.mark.parametrize("page", pages())

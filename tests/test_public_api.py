@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refused
 
 import estimation
 import hmmseg
@@ -16,20 +17,19 @@ import simgap
 from hmmseg import InputError, Rig, Task, Trial, align, segment
 
 STACK = Path(__file__).parents[1] / "recordings" / "none_1"
-PUBLIC = {
-    hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose diagnose "
-    "example_folder fit identify segment simulate",
-    estimation: "Identification identify read_actual",
-    simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate",
-}
+PUBLIC = {hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ align decompose diagnose "
+          "example_folder fit identify segment simulate", estimation: "Identification identify read_actual",
+          simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate"}  # fmt: skip
+CELLS = ("import hmmseg\nfolder = hmmseg.example_folder()\n"
+         "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
+         "found[0]", "print(f'{found[0]}')", "found[0].plot()")  # fmt: skip
 
 
 @pytest.mark.parametrize("package", PUBLIC, ids=lambda p: p.__name__)
 def test_what_is_public_is_listed_and_there(package):
     assert sorted(package.__all__) == PUBLIC[package].split()
     for name in package.__all__:
-        assert getattr(package, name) is not None
-        assert name in dir(package)
+        assert getattr(package, name) is not None and name in dir(package)
     assert {name for name in dir(package) if not name.startswith("__")} <= set(package.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = package.nothing
@@ -80,10 +80,8 @@ def test_a_process_whose_jax_is_single_precision_gets_the_same_answers(found):
     made = simgap.simulate(task, rig, found, seed=3)[0]
     model = simgap.VirtualModel(aligned.rig, aligned.task, made.blocks, {"block1": 0.13, "block2": 0.13})
     force = model.step([[0.10, 0.02], [0.15, 0.02]], [[0.0, 0.0], [0.0, 0.0]], 0.001)
-    double = [
-        aligned.segmentations[0].log_evidence, found.of("block1", "weight").mean(),
-        made.trial.channels["fx1"].sum(), force[0, 0],
-    ]  # fmt: skip
+    double = [aligned.segmentations[0].log_evidence, found.of("block1", "weight").mean(),
+              made.trial.channels["fx1"].sum(), force[0, 0]]  # fmt: skip
     assert single == pytest.approx(double, rel=1e-9)
 
 
@@ -104,32 +102,16 @@ def test_readers_take_paths_tables_and_arrays():
 
 
 def test_mistakes_say_what_to_write():
-    with pytest.raises(InputError, match="rig: missing"):
-        segment(STACK / "trial_01.csv", STACK / "task.toml")
-    with pytest.raises(InputError, match="no blocks"):
-        align(STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
+    refused("rig: missing", segment, STACK / "trial_01.csv", STACK / "task.toml")
+    refused("no blocks", align, STACK / "trial_01.csv", {"sequence": ["a", "b"]}, STACK / "rig.toml")
     bare = hmmseg.Trial("bare", np.arange(9.0), {"x1": np.zeros(9)})
-    with pytest.raises(InputError, match="bare: has no channel fx1"):
-        segment(bare, STACK / "task.toml", STACK / "rig.toml")
+    refused("bare: has no channel fx1", segment, bare, STACK / "task.toml", STACK / "rig.toml")
     with pytest.raises(InputError, match=r"block1\.width: missing; expected a number in m"):
         simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": {"weight": 0.3}, "block2": {}})
-    with pytest.raises(InputError, match="needs no fit"):
-        hmmseg.fit(STACK / "trial_01.csv", STACK / "task.toml")
-    for none in (
-        lambda: segment([], STACK / "task.toml", STACK / "rig.toml"),
-        lambda: segment([], {"sequence": ["a", "b"]}),
-    ):
-        with pytest.raises(InputError, match="trials: none given; expected at least one trial"):
-            none()
-
-
-CELLS = (
-    "import hmmseg\nfolder = hmmseg.example_folder()\n"
-    "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
-    "found[0]",
-    "print(f'{found[0]}')",
-    "found[0].plot()",
-)
+    refused("needs no fit", hmmseg.fit, STACK / "trial_01.csv", STACK / "task.toml")
+    for none in (lambda: segment([], STACK / "task.toml", STACK / "rig.toml"),
+                 lambda: segment([], {"sequence": ["a", "b"]})):  # fmt: skip
+        refused("trials: none given; expected at least one trial", none)
 
 
 def test_a_notebook_shows_every_result_once_and_every_plot():
@@ -143,17 +125,26 @@ def test_a_notebook_shows_every_result_once_and_every_plot():
     several, one, printed, plot = shown
     assert len(several) == len(one) == len(printed) == 1
     assert "pickup block1" in several[0].data["text/plain"] and "<table>" in one[0].data["text/html"]
-    assert "pickup block1" in printed[0].text
-    assert any("image/png" in output.data for output in plot)
+    assert "pickup block1" in printed[0].text and any("image/png" in output.data for output in plot)
 
 
-def test_results_are_text_though_rich_would_show_them_itself(found, monkeypatch):
-    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)
+def test_results_read_like_the_terminals_table_and_fill_no_screen(found, monkeypatch):
+    seen = {}
+    inside(found, seen)
+    assert len(seen) > 50
+    assert max(len(repr(value)) for value in seen.values()) < 2500  # characters
+    text = repr(found)
+    assert "block1" in text and "weight" in text and "95 % interval" in text
+    assert "<table>" in found._repr_html_() and "<td>block1</td>" in found._repr_html_()
+    segmentation = found.segmentations[0]
+    assert "pickup block1" in repr(segmentation) and "hold-on-ground" in segmentation._repr_html_()
+    aligned = found.aligned
+    assert "trial_02.csv" in repr(aligned) and len(aligned.to_json()["trials"]) == 2
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)  # though rich would show them itself
     assert "block1" in f"{found}" and "pickup block1" in repr(found.segmentations)
 
 
 def inside(value, seen):
-    """All dataclasses that can be reached from a result."""
     if id(value) in seen:
         return
     if dataclasses.is_dataclass(value):
@@ -165,24 +156,7 @@ def inside(value, seen):
             inside(each, seen)
 
 
-def test_no_part_of_a_result_fills_the_screen(found):
-    seen = {}
-    inside(found, seen)
-    assert len(seen) > 50
-    assert max(len(repr(value)) for value in seen.values()) < 2500  # characters
-
-
-def test_results_read_like_the_terminals_table(found):
-    text = repr(found)
-    assert "block1" in text and "weight" in text and "95 % interval" in text
-    assert "<table>" in found._repr_html_() and "<td>block1</td>" in found._repr_html_()
-    segmentation = found.segmentations[0]
-    assert "pickup block1" in repr(segmentation) and "hold-on-ground" in segmentation._repr_html_()
-    aligned = found.aligned
-    assert "trial_02.csv" in repr(aligned) and len(aligned.to_json()["trials"]) == 2
-
-
-def test_a_simulated_trial_shows_its_truth(found, tmp_path):
+def test_learned_models_and_simulated_trials_show_what_they_hold(found, tmp_path):
     made = simgap.simulate(STACK / "task.toml", STACK / "rig.toml", seed=3)[0]
     text = repr(made)
     assert "pickup block1" in text and "0.343 N" in text and "1.59 cm" in text
@@ -191,9 +165,6 @@ def test_a_simulated_trial_shows_its_truth(found, tmp_path):
     assert made.to_json()["seed"] == made.seed
     made.plot(tmp_path / "truth.png")
     assert (tmp_path / "truth.png").stat().st_size > 10_000
-
-
-def test_a_learned_model_says_how_long_its_states_last():
     t = np.arange(0.0, 6.0, 0.02)
     noise = np.random.default_rng(0).normal(0.0, 0.05, (4, t.size))
     trials = [{"t": t, "force": np.where(t < 2.0 + 0.3 * k, 0.0, 3.0) + noise[k]} for k in range(4)]
@@ -203,35 +174,27 @@ def test_a_learned_model_says_how_long_its_states_last():
     assert "<td>press</td>" in model._repr_html_()
 
 
-def test_a_wrong_name_names_the_nearest(found):
+def test_plots_return_axes_and_wrong_names_name_the_nearest(found, tmp_path):
     with pytest.raises(KeyError, match=r"blok1.*block1"):
         found.of("blok1", "weight")
     with pytest.raises(KeyError, match=r"wieght.*weight"):
         found.of("block1", "wieght")
     with pytest.raises(KeyError, match=r"did you mean weight"):
         found.of("block1", "mass")
-
-
-def test_plots_return_axes_and_save_where_asked(found, tmp_path):
-    assert len(found.segmentations[0].plot()) == 7
-    assert found.plot_estimates() is not None
+    assert len(found.segmentations[0].plot()) == 7 and found.plot_estimates() is not None
     assert len(found.plot_check()) == 2
     found.plot_posterior(str(tmp_path / "corner.png"))
     assert (tmp_path / "corner.png").stat().st_size > 10_000
     assert set(found.to_arviz().posterior) == {f"{o}.{p}" for o, p in found.names}
 
 
-def test_blocks_may_be_tables_of_their_properties():
+def test_blocks_may_be_tables_or_an_identification_or_its_json(found, tmp_path):
     one = {"weight": 0.3, "width": 0.02, "height": 0.02}
     made = simgap.simulate(STACK / "task.toml", STACK / "rig.toml", {"block1": one, "block2": one})
     assert {made[0].blocks["block1"].weight, made[0].blocks["block2"].weight} == {0.3}
-
-
-def test_an_identification_is_simulated_as_its_json_is(found, tmp_path):
     task = Task.read(STACK / "task.toml")
-    high = {
-        name: dataclasses.replace(f, lower_bound=1.5, mu_draws=None) for name, f in found.friction.items()
-    }
+    high = {name: dataclasses.replace(f, lower_bound=1.5, mu_draws=None)
+            for name, f in found.friction.items()}  # fmt: skip
     rough = dataclasses.replace(found, friction=high)
     (tmp_path / "found.json").write_text(json.dumps(rough.to_json()))
     blocks = simgap.simulate(task, STACK / "rig.toml", rough, seed=3)[0].blocks

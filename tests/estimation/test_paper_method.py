@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from estimation.paper_formulas import estimate_plugin
 from experiments.score_recordings import first_change_order
@@ -17,77 +18,65 @@ from hmmseg.errors import InputError
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask, Move, SequenceTask
 from hmmseg.io.trial import Trial
+from hmmseg.segmentation import thresholds
 from hmmseg.segmentation.spans import Segmentation, Span
-from hmmseg.segmentation.thresholds import (
-    StateLabels,
-    agreement,
-    label_states,
-    monotone_order,
-    segment_qualitative,
-    threshold,
-)
 
-STACK = BlockTask(
-    {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))
-)
+STACK = BlockTask({"block1": "block2", "block2": "ground"},
+                  (Move("block1", "ground"), Move("block2", "block1")))  # fmt: skip
 PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
 SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
 # fx1, fy1, fx2, fy2 [N], vx, vy [m/s] that show each state; s slides, 0 shows none.
-PATTERNS = {
-    "1": (0.0, 0.0, 0.0, 0.0, 0.2, 0.1),
-    "2": (2.0, 0.2, -2.0, 0.2, 0.2, 0.1),
-    "3": (2.0, -0.2, -2.0, 0.2, 0.0, 0.0),
-    "s": (2.0, -0.2, -2.0, -0.2, -0.2, 0.0),
-    "0": (2.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-}
+PATTERNS = {"1": (0.0, 0.0, 0.0, 0.0, 0.2, 0.1), "2": (2.0, 0.2, -2.0, 0.2, 0.2, 0.1),
+            "3": (2.0, -0.2, -2.0, 0.2, 0.0, 0.0), "s": (2.0, -0.2, -2.0, -0.2, -0.2, 0.0),
+            "0": (2.0, 0.0, 0.0, 0.0, 0.0, 0.0)}  # fmt: skip
+TOWER = BlockTask({"a": "b", "b": "c", "c": "ground"},
+                  (Move("a", "ground"), Move("b", "ground"), Move("c", "a")))  # fmt: skip
+WEIGHT = {"block1": 0.343, "block2": 0.437, "a": 0.2, "b": 0.3, "c": 0.4}
+WIDTH = {"block1": 0.0159, "block2": 0.0254, "a": 0.02, "b": 0.021, "c": 0.022}
+HEIGHT = {"block1": 0.016, "block2": 0.0127, "a": 0.01, "b": 0.011, "c": 0.013}
+PER_SUBTASK = 40
+# Height under the object at pickup and place, by move.
+RESTS = {"stack": ((HEIGHT["block2"], 0.0), (0.0, HEIGHT["block1"])),
+         "tower": ((HEIGHT["b"] + HEIGHT["c"], 0.0), (HEIGHT["c"], 0.0), (0.0, HEIGHT["a"]))}  # fmt: skip
 
 
 def make_signals(states: str, dt: float = 0.05) -> Signals:
     columns = np.array([PATTERNS[s] for s in states]).T
     fx1, fy1, fx2, fy2, vx, vy = columns
     zero = np.zeros(len(states))
-    return Signals(
-        t=np.arange(len(states)) * dt, x1=zero, y1=zero, vx1=vx, vy1=vy, fx1=fx1, fy1=fy1,
-        x2=zero + 0.02, y2=zero, vx2=vx, vy2=vy, fx2=fx2, fy2=fy2,
-        sd_x=zero, sd_y=zero, sd_vx=zero, sd_vy=zero, sd_force=0.01,
-    )  # fmt: skip
+    return Signals(t=np.arange(len(states)) * dt, x1=zero, y1=zero, vx1=vx, vy1=vy, fx1=fx1, fy1=fy1,
+                   x2=zero + 0.02, y2=zero, vx2=vx, vy2=vy, fx2=fx2, fy2=fy2, sd_x=zero, sd_y=zero,
+                   sd_vx=zero, sd_vy=zero, sd_force=0.01)  # fmt: skip
 
 
 def segment(states: str, task, **options):
     signals = make_signals(states)
-    return segment_qualitative(Trial("made.csv", signals.t, {}), signals, task, **options)
+    return thresholds.segment_qualitative(Trial("made.csv", signals.t, {}), signals, task, **options)
 
 
 def starts(segmentation) -> list[float]:
     return [span.start for span in segmentation.spans]
 
 
-def test_threshold_is_tri_valued_and_keeps_missing_samples_missing():
-    out = threshold(np.array([0.06, 0.05, 0.0, -0.05, -0.06, np.nan]), 0.05)
-    np.testing.assert_array_equal(out, [1, 0, 0, 0, -1, np.nan])
-
-
 @pytest.mark.parametrize(("state", "change", "options", "expected"), [
     ("1", {"fx1": -0.06}, {}, 0), ("1", {"fy1": -0.06}, {}, 0), ("1", {"fx2": -0.06}, {}, 0),
     ("1", {"fy2": -0.06}, {}, 0), ("3", {"vy1": 0.04, "vy2": 0.04}, {}, 3),
     ("3", {"vy1": 0.06, "vy2": 0.06}, {}, 0), ("3", {"fy2": 0.3}, {}, 2),
-    ("2", {}, {"force_threshold": 0.5}, 0),
-    ("2", {}, {"force_threshold": 0.5, "velocity_threshold": 0.15}, 3),
+    ("2", {}, {"force_threshold": 0.5}, 0), ("1", {"fx1": 0.05, "fx2": -0.05}, {}, 1),
+    ("1", {"fx1": 0.06}, {}, 0), ("2", {}, {"force_threshold": 0.5, "velocity_threshold": 0.15}, 3),
 ])  # fmt: skip
 def test_rules_ask_for_every_component_beyond_its_threshold(state, change, options, expected):
     signals = replace(make_signals(state), **{name: np.array([value]) for name, value in change.items()})
-    assert label_states(signals, **options).state[0] == expected
+    assert thresholds.label_states(signals, **options).state[0] == expected
 
 
 @pytest.mark.parametrize("state, name, expected", [
     ("1", "fy2", 0), ("2", "fx1", 0), ("2", "fy1", 0), ("2", "vy1", 2), ("3", "vy2", 0),
-    ("3", "vx1", 3), ("s", "vx1", 3),
-])  # fmt: skip
+    ("3", "vx1", 3), ("s", "vx1", 3)])  # fmt: skip
 def test_missing_sample_is_unidentified_only_where_its_signal_is_needed(state, name, expected):
     signals = replace(make_signals(state), **{name: np.array([np.nan])})
-    labels = label_states(signals)
-    assert labels.state[0] == expected
-    assert not labels.sliding[0]
+    labels = thresholds.label_states(signals)
+    assert labels.state[0] == expected and not labels.sliding[0]
 
 
 def test_clean_sequence_has_its_boundaries_half_way_between_samples():
@@ -103,13 +92,12 @@ def test_clean_sequence_has_its_boundaries_half_way_between_samples():
     assert out.spans[-1].end == pytest.approx(27 * 0.05) and out.spans[-1].end_sd == 0.0
 
 
-def test_dropouts_between_subtasks_widen_their_boundary():
+def test_flickering_grips_dropouts_and_ties_are_put_in_order():
     out = segment("1113300222233311", PICK)
     assert out.spans[2].start == pytest.approx((4 + 7) / 2 * 0.05)
     assert out.spans[2].start_sd == pytest.approx(3 * 0.05 / math.sqrt(12))
-
-
-def test_oscillating_grip_is_recovered_by_the_monotone_order_only():
+    out = segment("111" + "323" + "2222" + "333" + "111", PICK)
+    assert out.spans[2].start == pytest.approx(5.5 * 0.05)
     # The grip flickers to hold-above-ground and back before it lifts, as real grips do.
     states = "11111" + "3233333" + "22222222" + "33333" + "1111"
     monotone, first = segment(states, PICK), segment(states, PICK, order=first_change_order)
@@ -118,23 +106,21 @@ def test_oscillating_grip_is_recovered_by_the_monotone_order_only():
     np.testing.assert_allclose(starts(first)[1:4], (np.array([5, 6, 7]) - 0.5) * 0.05)
 
 
-def test_equal_agreement_goes_to_holding_on_the_ground():
-    out = segment("111" + "323" + "2222" + "333" + "111", PICK)
-    assert out.spans[2].start == pytest.approx(5.5 * 0.05)
-
-
-def test_ground_sliding_counts_as_hold_on_ground_unless_the_move_is_a_slide():
+def test_slides_and_repeats_are_counted_as_the_task_has_them():
     carried = segment("1113s3222233s11", PICK)
     assert carried.complete
     slid = segment("111" + "33" + "ssss" + "33" + "11", SLIDE)
     assert [s.subtask for s in slid.spans] == ["pregrasp", "pickup", "slide", "place", "release"]
     np.testing.assert_allclose(starts(slid)[1:], (np.array([3, 5, 9, 11]) - 0.5) * 0.05)
-    np.testing.assert_allclose(
-        starts(segment("111" + "33" + "ssss" + "33" + "11", SLIDE, order=first_change_order)), starts(slid)
-    )
+    np.testing.assert_allclose(starts(segment("111" + "33" + "ssss" + "33" + "11", SLIDE,
+                                              order=first_change_order)), starts(slid))  # fmt: skip
+    task = replace(PICK, repeat="unknown")
+    for number in (1, 2, 3):
+        out = segment("111" + "3332222333111" * number, task)
+        assert out.complete and len(out.spans) == 1 + 4 * number
 
 
-def test_a_move_that_never_happens_fails_at_its_pickup_and_keeps_the_rest():
+def test_a_move_that_never_happens_fails_at_its_pickup_though_a_grip_flickers():
     out = segment("1113322222333111111", STACK)
     assert not out.complete and out.failed is not None
     assert (out.failed.index, out.failed.subtask, out.failed.object) == (5, "pickup", "block2")
@@ -142,29 +128,16 @@ def test_a_move_that_never_happens_fails_at_its_pickup_and_keeps_the_rest():
     assert [s.subtask for s in out.spans] == ["pregrasp", "pickup", "carry", "place", "release"]
     assert out.spans[-1].end == pytest.approx(18 * 0.05)
     json.dumps(out.to_json(), allow_nan=False)
-
-
-def test_flicker_does_not_pass_for_a_later_move():
     # Agreeing with the first 2 and 3 of the flicker would make the rest the moves of block2.
     out = segment("1" * 30 + "2" + "3" * 12 + "2" * 30 + "3" * 12 + "1" * 30, STACK)
-    assert out.failed is not None and out.failed.index == 5
-    assert [s.object for s in out.spans] == ["block1"] * 5
-
-
-def test_an_unknown_number_of_repeats_is_counted():
-    task = replace(PICK, repeat="unknown")
-    for number in (1, 2, 3):
-        out = segment("111" + "3332222333111" * number, task)
-        assert out.complete and len(out.spans) == 1 + 4 * number
+    assert out.failed.index == 5 and [s.object for s in out.spans] == ["block1"] * 5
 
 
 def test_refused_input():
     with pytest.raises(InputError, match=r"--force-threshold: found 0\.0; expected a number > 0"):
         segment("111", PICK, force_threshold=0.0)
-    with pytest.raises(InputError, match="--velocity-threshold: found nan"):
-        segment("111", PICK, velocity_threshold=math.nan)
-    with pytest.raises(InputError, match="plain ordered task"):
-        segment("111", SequenceTask(("a", "b")))
+    refused("--velocity-threshold: found nan", segment, "111", PICK, velocity_threshold=math.nan)
+    refused("plain ordered task", segment, "111", SequenceTask(("a", "b")))
 
 
 def best_agreement(agrees: np.ndarray) -> float | None:
@@ -182,31 +155,16 @@ def best_agreement(agrees: np.ndarray) -> float | None:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.sampled_from([0, 1, 2, 3]), min_size=8, max_size=12))
 def test_monotone_order_against_enumeration(states):
-    labels = StateLabels(np.array(states), np.zeros(len(states), dtype=bool))
+    labels = thresholds.StateLabels(np.array(states), np.zeros(len(states), dtype=bool))
     steps = subtasks(PICK)
-    out, best = monotone_order(labels, steps), best_agreement(agreement(labels, steps))
+    out, best = thresholds.monotone_order(labels, steps), best_agreement(thresholds.agreement(labels, steps))
     assert out.complete == (best is not None)
     if best is not None:
         assert out.agreement == pytest.approx(best)
         assert out.agreement >= first_change_order(labels, steps).agreement
 
 
-TOWER = BlockTask(
-    {"a": "b", "b": "c", "c": "ground"}, (Move("a", "ground"), Move("b", "ground"), Move("c", "a"))
-)
-WEIGHT = {"block1": 0.343, "block2": 0.437, "a": 0.2, "b": 0.3, "c": 0.4}
-WIDTH = {"block1": 0.0159, "block2": 0.0254, "a": 0.02, "b": 0.021, "c": 0.022}
-HEIGHT = {"block1": 0.016, "block2": 0.0127, "a": 0.01, "b": 0.011, "c": 0.013}
-PER_SUBTASK = 40
-# Height under the object at pickup and place, by move.
-RESTS = {
-    "stack": ((HEIGHT["block2"], 0.0), (0.0, HEIGHT["block1"])),
-    "tower": ((HEIGHT["b"] + HEIGHT["c"], 0.0), (HEIGHT["c"], 0.0), (0.0, HEIGHT["a"])),
-}
-
-
 def make(task: BlockTask, rests, seed: int | None = None) -> tuple[Signals, Segmentation]:
-    """One trial whose subtasks last 40 samples each, with scatter if a seed is given."""
     steps = subtasks(task)
     size = PER_SUBTASK * len(steps)
     t = np.arange(size) * 0.05
@@ -217,12 +175,10 @@ def make(task: BlockTask, rests, seed: int | None = None) -> tuple[Signals, Segm
     for i, step in enumerate(steps):
         inside = slice(i * PER_SUBTASK, (i + 1) * PER_SUBTASK)
         start, end = t[inside][0] - 0.025, t[inside][-1] + 0.025
-        spans.append(
-            Span(step.name, step.object, step.state, start, end, 0.0, 0.0, (start, start), (end, end))
-        )
+        spans.append(Span(step.name, step.object, step.state, start, end, 0.0, 0.0, (start, start),
+                          (end, end)))  # fmt: skip
         if step.state == FREE:
             continue
-        assert step.move is not None
         lift = 0.03 if step.state == ABOVE_GROUND else rests[step.move][step.name == "place"]
         s.y2[inside] = s.y1[inside] = lift + 0.004
         s.x2[inside] = WIDTH[step.object]
@@ -251,13 +207,21 @@ def test_exact_signals_give_the_planted_properties(task, rests):
     assert reasons == {}
 
 
-def test_trim_leaves_out_five_percent_at_either_end():
+def test_the_ends_of_a_carry_dropouts_and_missing_samples_are_left_out():
     signals, segmentation = make(STACK, RESTS["stack"])
-    carry = slice(2 * PER_SUBTASK, 3 * PER_SUBTASK)
-    third = signals.fy1.copy()
+    carry, third = slice(2 * PER_SUBTASK, 3 * PER_SUBTASK), signals.fy1.copy()
     third[carry.start + 2] += 3.6  # the first sample behind the trimmed two of forty
     properties, _ = estimate_plugin([replace(signals, fy1=third)], [segmentation], STACK)
     assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343 + 3.6 / 36)
+    state = np.where(np.abs(signals.fx1) > 1, np.where(signals.fy > 0, 2, 3), 1)
+    wild, gap = 2 * PER_SUBTASK + 10, 2 * PER_SUBTASK + 11
+    fy1 = signals.fy1.copy()
+    fy1[wild], fy1[gap] = 50.0, np.nan
+    state[[wild, gap]] = 0
+    labels = thresholds.StateLabels(state, np.zeros(state.size, dtype=bool))
+    properties, _ = estimate_plugin([replace(signals, fy1=fy1)], [segmentation], STACK, [labels])
+    assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343)
+    assert properties["block1"]["friction"]["lower_bound"] == pytest.approx(0.3)
 
 
 def test_standard_deviation_is_the_samples_and_trials_pool_by_mean():
@@ -272,36 +236,20 @@ def test_standard_deviation_is_the_samples_and_trials_pool_by_mean():
     assert pooled["mean"] - pooled["interval_68"][0] == pytest.approx(0.994458 * pooled["standard_error"])
 
 
-def test_dropouts_and_missing_samples_are_left_out():
-    signals, segmentation = make(STACK, RESTS["stack"])
-    state = np.where(np.abs(signals.fx1) > 1, np.where(signals.fy > 0, 2, 3), 1)
-    wild, gap = 2 * PER_SUBTASK + 10, 2 * PER_SUBTASK + 11
-    fy1 = signals.fy1.copy()
-    fy1[wild], fy1[gap] = 50.0, np.nan
-    state[[wild, gap]] = 0
-    labels = StateLabels(state, np.zeros(state.size, dtype=bool))
-    properties, _ = estimate_plugin([replace(signals, fy1=fy1)], [segmentation], STACK, [labels])
-    assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343)
-    assert properties["block1"]["friction"]["lower_bound"] == pytest.approx(0.3)
-
-
 def test_what_the_task_or_the_recording_withholds_is_none_with_a_reason():
     steps = subtasks(PICK)
     stack, segmentation = make(STACK, RESTS["stack"])
     names = {"block1": "block", "block2": "block"}
     spans = tuple(replace(s, object=names[str(s.object)]) for s in segmentation.spans[: len(steps)])
     properties, reasons = estimate_plugin([stack], [replace(segmentation, spans=spans)], PICK)
-    assert properties["block"]["height"] is None
-    assert "height" in reasons["block.height"]
+    assert properties["block"]["height"] is None and "height" in reasons["block.height"]
     assert properties["block"]["weight"] is not None
-
     half = replace(segmentation, spans=segmentation.spans[:5])  # the second move is missing
     properties, reasons = estimate_plugin([stack], [half], STACK)
     assert properties["block1"]["height"] is None and properties["block2"]["weight"] is None
     assert properties["block2"]["height"]["mean"] == pytest.approx(HEIGHT["block2"])
     assert set(reasons) == {f"block2.{p}" for p in ("weight", "width", "friction")} | {"block1.height"}
     json.dumps(properties, allow_nan=False)
-
     assert "block" in estimate_plugin([stack], [replace(half, spans=())], SLIDE)[1]["block.weight"]
 
 

@@ -1,8 +1,4 @@
-"""A number that is printed with confidence is no nonsense: recordings altered as sensors and rigs go wrong.
-
-Each row says how a healthy recording is altered, what a warning must name, and which properties hang on it:
-they are null with a reason that names it as well, or their intervals hold the truth. All others stay right.
-"""
+"""A number printed with confidence is no nonsense: recordings altered as sensors and rigs go wrong."""
 
 import re
 import tomllib
@@ -34,6 +30,8 @@ TABLE = {name: v.to_numpy(float) for name, v in pd.read_csv(FOLDER / "trial_01.c
 
 PLACE = np.arange(TABLE["t"].size)
 NAMES = [name for name in TABLE if name != "t"]
+QUICK = ("frozen force", "constant", "frozen encoder", "wild cell", "saturated", "drifting zero", "twice",
+         "one finger", "one vertical", "clock")  # fmt: skip
 
 
 def at(share):
@@ -93,22 +91,15 @@ ALTERED = {
     "every other row": (lambda c: {n: np.where(PLACE % 2, c[n], np.nan) for n in NAMES},
                          "every channel lacks 50% of its readings"),
     "holes": (lacking(len(NAMES)), "every row without some reading"),
-    "clock": (later(0.5, 1.0), "t jumps by 1.05 s at 4.95 s"),
-}  # fmt: skip
+    "clock": (later(0.5, 1.0), "t jumps by 1.05 s at 4.95 s")}  # fmt: skip
 
 
-QUICK = ("frozen force", "constant", "frozen encoder", "wild cell", "saturated", "drifting zero", "twice",
-         "one finger", "one vertical", "clock")  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in ALTERED]
-)
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow)
+                                  for n in ALTERED])  # fmt: skip
 def test_what_a_sensor_cannot_have_read_is_named_and_no_number_hangs_on_it(name):
     alter, named = ALTERED[name]
-    assert_no_number_misleads(
-        identify(TABLE | alter(TABLE), FOLDER / "task.toml", FOLDER / "rig.toml"), named
-    )
+    assert_no_number_misleads(identify(TABLE | alter(TABLE), FOLDER / "task.toml", FOLDER / "rig.toml"),
+                              named)  # fmt: skip
 
 
 def assert_no_number_misleads(found, named):
@@ -123,12 +114,21 @@ def assert_no_number_misleads(found, named):
                 assert found.reasons[f"{obj}.{prop}"]
 
 
-def test_forces_in_steps_coarser_than_their_noise_are_known_no_better():
+def test_coarse_forces_and_hands_that_stand_closer_say_no_more_than_they_can():
     rounded = {name: 0.25 * np.round(TABLE[name] / 0.25) for name in FORCES}
     found = identify(TABLE | rounded, FOLDER / "task.toml", FOLDER / "rig.toml")
     for obj, props in TRUTH.items():
         low, high = np.quantile(found.of(obj, "weight"), [0.01, 0.99])
         assert low <= props["weight"] <= high, (obj, low, high)
+    rig = tomllib.loads((FOLDER / "rig.toml").read_text())
+    hand(wider=-0.01)(rig)
+    found = identify(TABLE, FOLDER / "task.toml", rig)
+    assert found.of("block1", "width").mean() == pytest.approx(TRUTH["block1"]["width"] - 0.01, abs=1e-4)
+    assert any("bases that stand closer than it says would not show" in note for note in found.notes)
+    hand(wider=-0.04)(rig)  # a width below nothing is none, and the weights stay
+    found = identify(TABLE, FOLDER / "task.toml", rig)
+    assert "comes out at -0.0312 m" in found.reasons["block1.width"]
+    assert found.of("block1", "weight").mean() == pytest.approx(0.578, rel=0.02)
 
 
 def hand(wider=0.0, higher=0.0, **links):
@@ -141,12 +141,10 @@ def hand(wider=0.0, higher=0.0, **links):
     return alter
 
 
-RIGS = {
-    "wider by 5 cm": (hand(wider=0.05), "comes 3. mm within a block that stands"),
-    "links too long": (hand(links1=1.1, links2=1.1), "is held .* mm beneath its bottom"),
-    "links too short": (hand(links1=0.9, links2=0.9), "is held .* mm above its top"),
-    "one finger's links": (hand(links1=1.1), "distance changes by 9.5 cm a metre"),
-}
+RIGS = {"wider by 5 cm": (hand(wider=0.05), "comes 3. mm within a block that stands"),
+        "links too long": (hand(links1=1.1, links2=1.1), "is held .* mm beneath its bottom"),
+        "links too short": (hand(links1=0.9, links2=0.9), "is held .* mm above its top"),
+        "one finger's links": (hand(links1=1.1), "distance changes by 9.5 cm a metre")}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -182,30 +180,23 @@ def test_a_tie_is_as_sure_as_bayes_rule_over_its_two_hypotheses_makes_it(kind):
     assert Tie(kind, value, error, (), "").probability == pytest.approx(expected)
 
 
-def test_what_nothing_contradicts_is_said_and_a_width_below_nothing_is_none():
-    rig = tomllib.loads((FOLDER / "rig.toml").read_text())
-    hand(wider=-0.01)(rig)
-    found = identify(TABLE, FOLDER / "task.toml", rig)
-    assert found.of("block1", "width").mean() == pytest.approx(TRUTH["block1"]["width"] - 0.01, abs=1e-4)
-    assert any("bases that stand closer than it says would not show" in note for note in found.notes)
-    hand(wider=-0.04)(rig)  # a width below nothing is none, and the weights stay
-    found = identify(TABLE, FOLDER / "task.toml", rig)
-    assert "comes out at -0.0312 m" in found.reasons["block1.width"]
-    assert found.of("block1", "weight").mean() == pytest.approx(0.578, rel=0.02)
-
-
-def test_healthy_recordings_show_no_fault():
+def test_healthy_recordings_erring_clocks_and_recordings_without_noise_show_no_fault():
     for path in sorted(FOLDER.parent.glob("*/trial_*.csv")):
         rig = read_rig(path.parent / "rig.toml")
         assert remove_faults(trial_of(read_table(path), rig, None), rig).faults == ()
-
-
-def test_a_clock_that_errs_is_no_encoder_that_loses_counts():
     rig = read_rig(FOLDER / "rig.toml")
     jitter = np.random.default_rng(0).normal(0.0, 0.012, (40, TABLE["t"].size))
     for late in jitter:
         table = TABLE | {"t": np.sort(TABLE["t"] + late)}
         assert not any("jumps by" in line for line in read_trial(table, rig).warnings)
+    t = TABLE["t"]
+    way = np.interp(t, [0.0, 2.0, 4.0, 6.0, 10.0], [0.0, 0.0, 1.0, 1.0, 0.3])
+    smooth = {"t": t} | {name: -1.0 + 0.1 * (i + 1) * way
+                         for i, name in enumerate(("q11", "q12", "q21", "q22"))}  # fmt: skip
+    smooth |= {f"d{name}": np.gradient(values, t) for name, values in smooth.items() if name != "t"}
+    smooth |= {name: sign * np.clip(way - 0.5, 0.0, 1.0)
+               for name, sign in zip(FORCES, (1, 0.1, -1, 0.1), strict=True)}  # fmt: skip
+    assert read_trial(smooth, rig).faults == ()
 
 
 @pytest.mark.parametrize("step", [0.02, 0.05, 0.2])
@@ -216,19 +207,3 @@ def test_coarse_forces_and_forces_held_for_some_samples_are_none(step):
     silent = TABLE | {name: np.where(np.abs(TABLE[name]) < step, 0.0, TABLE[name]) for name in FORCES}
     for columns in (coarse, held, silent):
         assert read_trial(columns, rig).faults == ()
-
-
-def test_a_recording_without_noise_may_stand_still():
-    """A hand of a noise-free simulation that waits: every position repeats itself, and none is at fault."""
-    rig = read_rig(FOLDER / "rig.toml")
-    t = TABLE["t"]
-    way = np.interp(t, [0.0, 2.0, 4.0, 6.0, 10.0], [0.0, 0.0, 1.0, 1.0, 0.3])
-    smooth = {"t": t} | {
-        name: -1.0 + 0.1 * (i + 1) * way for i, name in enumerate(("q11", "q12", "q21", "q22"))
-    }
-    smooth |= {f"d{name}": np.gradient(values, t) for name, values in smooth.items() if name != "t"}
-    smooth |= {
-        name: sign * np.clip(way - 0.5, 0.0, 1.0)
-        for name, sign in zip(FORCES, (1, 0.1, -1, 0.1), strict=True)
-    }
-    assert read_trial(smooth, rig).faults == ()

@@ -32,7 +32,6 @@ SERVO = Servo(0.12, 800.0, 19.0)
 
 @pytest.fixture(scope="module")
 def motion():
-    """A healthy trial."""
     return perform(plan(TASK, BLOCKS, HEALTHY, Style(), np.random.default_rng(4)), BLOCKS, HEALTHY)
 
 
@@ -49,14 +48,11 @@ def run(world: World, centres: dict[str, tuple[float, float]], seconds: float, c
     return model, data, np.array(heights)
 
 
-def test_a_block_falls_freely():
+def test_a_block_falls_freely_and_a_table_yields_by_the_load_and_tilts_about_its_pivot():
     _, _, z = run(HEALTHY, {"block1": (0.1, 0.15), "block2": (0.2, 0.007)}, 0.1)
     t = np.arange(1, len(z) + 1) * STEP
     # Semi-implicit Euler falls by g t (t + step) / 2.
     np.testing.assert_allclose(z, -RIG.gravity * t * (t + STEP) / 2, atol=1e-8)
-
-
-def test_a_table_yields_by_the_load_and_tilts_about_its_pivot():
     rest = {"block1": (0.115, 0.014 + 0.0085), "block2": (0.115, 0.007)}
     _, _, z = run(replace(HEALTHY, table_stiffness=1000.0), rest, 0.8)
     assert z[-1] == pytest.approx(-(0.5 + 0.35) / 1000.0, rel=0.01)
@@ -65,11 +61,10 @@ def test_a_table_yields_by_the_load_and_tilts_about_its_pivot():
     x = data.joint("x_block1").qpos[0]
     assert data.joint("turn_block1").qpos[0] == pytest.approx(0.03, abs=2e-4)
     along = 0.165 + x - PIVOT
-    assert 0.0102 + z[-1] == pytest.approx(0.03 * along + 0.0085, abs=3e-5)
-    assert abs(x) < 5e-4
+    assert 0.0102 + z[-1] == pytest.approx(0.03 * along + 0.0085, abs=3e-5) and abs(x) < 5e-4
 
 
-def test_fingers_carry_the_weight_and_nothing_in_free_motion(motion):
+def test_fingers_carry_the_weight_and_pads_are_linear_and_do_not_slip(motion):
     touch, leave, meet, part = motion.boundaries[:4]
     air = (motion.t > leave + 0.05) & (motion.t < meet - 0.02)
     net = motion.force[air, 1] + motion.force[air, 3]
@@ -77,9 +72,6 @@ def test_fingers_carry_the_weight_and_nothing_in_free_motion(motion):
     np.testing.assert_allclose(net, 0.5 * (1 + a / RIG.gravity), atol=0.01)
     free = (motion.t < touch - 0.02) | ((motion.t > part + 0.1) & (motion.t < motion.boundaries[4] - 0.02))
     assert np.abs(motion.force[free]).max() < 1e-4
-
-
-def test_pads_are_linear_and_do_not_slip(motion):
     touch, _, _, part = motion.boundaries[:4]
     held = (motion.t > touch + 0.1) & (motion.t < part - 0.1)
     p, f = motion.position[held], motion.force[held]
@@ -91,7 +83,6 @@ def test_pads_are_linear_and_do_not_slip(motion):
 
 
 def test_pads_touch_no_block_but_the_one_that_is_moved(monkeypatch):
-    """Low blocks on wide ones, pressed hard: what is beneath is as near to the pads as it can be."""
     touched: set[tuple[str, int]] = set()
     step = mujoco.mj_step
 
@@ -120,12 +111,23 @@ def test_angles_and_tips_are_inverse(motion):
     assert np.abs(tips(RIG, longer) - motion.position).max() > 1e-3
 
 
-def test_noise_has_the_rigs_size(motion):
+def test_worlds_are_drawn_apart_and_noise_is_as_the_rig_says_or_as_drawn(motion):
     signals = sense(motion, RIG, [], np.random.default_rng(0))
     _, noisy = sample(signals, Sampling(), np.random.default_rng(1))
     _, quiet = sample(signals, Sampling(), np.random.default_rng(1), noisy=False)
     for name, sd in (("q11", RIG.angle_noise), ("dq22", RIG.velocity_noise), ("fy1", RIG.force_noise)):
         assert np.std(noisy[name] - quiet[name]) == pytest.approx(sd, rel=0.2)
+    drawn = [draw_world(np.random.default_rng(k)) for k in range(40)]
+    assert {w.profile for w in drawn} == {"minimum_jerk", "trapezoid", "person"}
+    assert len({w.task for w in drawn}) >= 4 and min(w.pace for w in drawn) < 0.6
+    signals, rng = sense(motion, RIG, [], np.random.default_rng(0)), lambda: np.random.default_rng(1)
+    odd = Sampling(noise=(1.0, 1.0, 1.3), colour=0.3, differences=True)
+    _, noisy = sample(signals, odd, rng())
+    _, quiet = sample(signals, odd, rng(), noisy=False)
+    e = np.concatenate([noisy[c] - quiet[c] for c in ("fx1", "fy1", "fx2", "fy2")])
+    assert np.std(e) == pytest.approx(1.3 * RIG.force_noise, rel=0.1)
+    assert np.corrcoef(e[1:], e[:-1])[0, 1] == pytest.approx(0.3, abs=0.1)
+    np.testing.assert_allclose(noisy["dq11"][1:], np.diff(noisy["q11"]) * RIG.rate)
 
 
 def test_sensing_effects_are_what_the_contract_says(motion):
@@ -148,27 +150,39 @@ def test_sensing_effects_are_what_the_contract_says(motion):
     assert drift[-1] == pytest.approx(0.02 * t[-1], rel=1e-6)
 
 
-def test_an_off_centre_mass_makes_the_shear_unequal():
+def test_an_off_centre_mass_makes_shears_unequal_and_stiff_pads_do_not_chatter():
     rng = lambda: np.random.default_rng(4)  # noqa: E731
     tips_round = replace(HEALTHY, pad_turning=0.02)
     moved = replace(tips_round, mass_offset=0.003)
     a = perform(plan(TASK, BLOCKS, tips_round, Style(), rng()), BLOCKS, tips_round)
     b = perform(plan(TASK, BLOCKS, moved, Style(), rng()), BLOCKS, moved)
     leave, meet = a.boundaries[1:3]
-    air = (a.t > leave + 0.2) & (a.t < meet - 0.1)
-    n = min(len(a.t), len(b.t))
+    air, n = (a.t > leave + 0.2) & (a.t < meet - 0.1), min(len(a.t), len(b.t))
     more = (b.force[:n] - a.force[:n])[air[:n]].mean(0)
     couple = 0.5 * 0.003 / 0.017
     # The heavier side sinks and the grip then pushes askew; pads that resist turning take some of it.
     np.testing.assert_allclose(more[[1, 3]], [-couple, couple], rtol=0.2)
+    # At steps of 0.5 ms this one does, in its second carry.
+    lower, upper = Block(0.6086, 0.02207, 0.01567, 0.766), Block(0.4259, 0.01764, 0.01382, 0.55)
+    blocks = {"block1": upper, "block2": lower}
+    stiff = replace(HEALTHY, normal_stiffness=4460.0, shear_stiffness=2830.0, pad_turning=4.8)
+    style = Style(profile="trapezoid", stagger=(0.0, 0.0))
+    motion = perform(plan(TASK, blocks, stiff, style, np.random.default_rng(0)), blocks, stiff)
+    for leave, meet in (motion.boundaries[1:3], motion.boundaries[5:7]):
+        air = (motion.t > leave + 0.1) & (motion.t < meet - 0.1)
+        assert np.abs(np.diff(motion.force[air], 2, axis=0)).std() < 0.01  # N, between milliseconds
 
 
-def test_every_contract_effect_is_there():
+def test_every_contract_effect_is_there_and_sets_are_drawn_alike_and_keep_their_shares():
     known = {n for n, e in catalogue().items() if e.chosen}
     assert known <= set(CATALOGUE)
     for name, made in CATALOGUE.items():
         values = made.draw(np.random.default_rng(0), 0.5)
         assert values and all(np.isfinite(list(values.values()))), name
+    assert sets.draw_cases(30, 3, RIG) == sets.draw_cases(30, 3, RIG)
+    assert sets.draw_cases(30, 3, RIG) != sets.draw_cases(30, 4, RIG)
+    drawn = [c.tier for c in sets.draw_cases(sum(sets.TIERS.values()), 3, RIG)]
+    assert {t: drawn.count(t) for t in sets.TIERS} == sets.TIERS
 
 
 def test_a_world_is_what_its_rig_and_label_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -186,44 +200,25 @@ def test_a_world_is_what_its_rig_and_label_say(tmp_path: Path, monkeypatch: pyte
         np.testing.assert_allclose(np.diff(t), 1 / world.rate, atol=1.1e-5)
 
 
-def test_worlds_are_drawn_apart_and_noise_is_as_drawn(motion):
-    drawn = [draw_world(np.random.default_rng(k)) for k in range(40)]
-    assert {w.profile for w in drawn} == {"minimum_jerk", "trapezoid", "person"}
-    assert len({w.task for w in drawn}) >= 4 and min(w.pace for w in drawn) < 0.6
-    signals, rng = sense(motion, RIG, [], np.random.default_rng(0)), lambda: np.random.default_rng(1)
-    odd = Sampling(noise=(1.0, 1.0, 1.3), colour=0.3, differences=True)
-    _, noisy = sample(signals, odd, rng())
-    _, quiet = sample(signals, odd, rng(), noisy=False)
-    e = np.concatenate([noisy[c] - quiet[c] for c in ("fx1", "fy1", "fx2", "fy2")])
-    assert np.std(e) == pytest.approx(1.3 * RIG.force_noise, rel=0.1)
-    assert np.corrcoef(e[1:], e[:-1])[0, 1] == pytest.approx(0.3, abs=0.1)
-    np.testing.assert_allclose(noisy["dq11"][1:], np.diff(noisy["q11"]) * RIG.rate)
-
-
-def test_a_finger_may_close_first_and_the_truth_is_of_the_grip():
-    together, apart = (
-        perform(plan(TASK, BLOCKS, HEALTHY, Style(stagger=(s, s)), np.random.default_rng(4)), BLOCKS, HEALTHY)
-        for s in (0.0, 0.08)
-    )
+def test_a_finger_may_close_first_but_meets_no_other_block():
+    together, apart = (perform(plan(TASK, BLOCKS, HEALTHY, Style(stagger=(s, s)), np.random.default_rng(4)),
+                               BLOCKS, HEALTHY) for s in (0.0, 0.08))  # fmt: skip
     for motion in (together, apart):
         touch = np.searchsorted(motion.t, motion.boundaries[0])
         both = (motion.force[:, 0] > 2e-3) & (-motion.force[:, 2] > 2e-3)
         assert both[touch + 1] and not both[: touch - 1].any()
     pushed = lambda m: abs(m.centres[np.searchsorted(m.t, m.boundaries[0]), 0, 0] - m.centres[0, 0, 0])  # noqa: E731
     assert pushed(together) < 3e-4 < 8e-4 < pushed(apart)
-
-
-def test_sets_are_drawn_alike_and_keep_their_shares():
-    assert sets.draw_cases(30, 3, RIG) == sets.draw_cases(30, 3, RIG)
-    assert sets.draw_cases(30, 3, RIG) != sets.draw_cases(30, 4, RIG)
-    drawn = [c.tier for c in sets.draw_cases(sum(sets.TIERS.values()), 3, RIG)]
-    assert {t: drawn.count(t) for t in sets.TIERS} == sets.TIERS
+    t, touched = np.arange(6.0), np.zeros((6, 2), bool)
+    touched[[1, 2], [0, 0]] = touched[[4, 5], [1, 0]] = True
+    _check_touches(t, touched, (2.5, 5.0), [0, 1])
+    with pytest.raises(ValueError, match="another block"):
+        _check_touches(t, touched, (2.5, 4.5), [0, 1])
 
 
 def test_a_seal_is_kept_and_a_changed_label_is_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sets, "TRIALS", 1)
-    found = generate(2, 7, tmp_path)
-    again = generate(2, 7, tmp_path / "again")
+    found, again = generate(2, 7, tmp_path), generate(2, 7, tmp_path / "again")
     assert found != again  # salted anew
     a, b = unseal(tmp_path), unseal(tmp_path / "again")
     assert a == b
@@ -239,23 +234,3 @@ def test_a_seal_is_kept_and_a_changed_label_is_caught(tmp_path: Path, monkeypatc
     file.write_text(json.dumps(labels))
     with pytest.raises(BrokenSeal, match=found):
         unseal(tmp_path)
-
-
-def test_a_stiff_pad_that_can_turn_does_not_chatter():
-    # At steps of 0.5 ms this one does, in its second carry.
-    lower, upper = Block(0.6086, 0.02207, 0.01567, 0.766), Block(0.4259, 0.01764, 0.01382, 0.55)
-    blocks = {"block1": upper, "block2": lower}
-    stiff = replace(HEALTHY, normal_stiffness=4460.0, shear_stiffness=2830.0, pad_turning=4.8)
-    style = Style(profile="trapezoid", stagger=(0.0, 0.0))
-    motion = perform(plan(TASK, blocks, stiff, style, np.random.default_rng(0)), blocks, stiff)
-    for leave, meet in (motion.boundaries[1:3], motion.boundaries[5:7]):
-        air = (motion.t > leave + 0.1) & (motion.t < meet - 0.1)
-        assert np.abs(np.diff(motion.force[air], 2, axis=0)).std() < 0.01  # N, between milliseconds
-
-
-def test_a_finger_that_meets_another_block_is_no_trial():
-    t, touched = np.arange(6.0), np.zeros((6, 2), bool)
-    touched[[1, 2], [0, 0]] = touched[[4, 5], [1, 0]] = True
-    _check_touches(t, touched, (2.5, 5.0), [0, 1])
-    with pytest.raises(ValueError, match="another block"):
-        _check_touches(t, touched, (2.5, 4.5), [0, 1])

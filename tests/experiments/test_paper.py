@@ -23,31 +23,24 @@ def shortfalls(case):
     return rigid.shortfalls(case)
 
 
-def test_rigid_fingertips_make_widths_short_by_what_the_pads_give(shortfalls):
+def test_stiffness_and_widths_follow_from_the_recordings_and_rigid_pads_are_short(shortfalls, case):
     assert len(shortfalls) == 20
     for name in sources.BLOCKS:
         rows = [row for row in shortfalls if row["object"] == name]
         assert 1.0e-3 < np.mean([row["short"] for row in rows]) < 1.6e-3
     for row in shortfalls:
-        assert row["short"] == pytest.approx(row["predicted"], abs=3e-5)
-        assert abs(row["remaining"]) < 3e-5
-
-
-def test_pad_stiffness_and_width_follow_from_the_recordings_alone(case):
+        assert row["short"] == pytest.approx(row["predicted"], abs=3e-5) and abs(row["remaining"]) < 3e-5
     for name, width in rigid.ACTUAL.items():
         found = rigid.from_the_data(case, name)
         assert found["stiffness"] == pytest.approx(4000, rel=0.03)
         assert found["width"] == pytest.approx(width, abs=3e-5)
 
 
-def test_states_come_in_the_expected_order(case):
+def test_states_come_in_the_expected_order_and_as_the_papers_table_2_has_them(case):
     rows = recording.trials(case)
     assert all(row["ordered"] == list(recording.EXPECTED) for row in rows)
     assert rows[sources.ONE]["sequence"] == list(recording.EXPECTED)
     assert sum(row["flickers"] > 0 for row in rows) >= 1  # the weakness is there to be seen
-
-
-def test_table_2_is_the_papers():
     rows = {row.pop("state"): row for row in tables.table_2()}
     assert rows["free-motion"] == {"vx": "", "vy": "", "fx": "0", "fy": "0", "grip": "0", "shear": "0"}
     on_ground = {"vx": "0", "vy": "0", "fx": "", "fy": "- or 0", "grip": "+", "shear": ""}
@@ -56,22 +49,18 @@ def test_table_2_is_the_papers():
     assert rows["hold-above-ground"] == {"vx": "", "vy": "", "fx": "", "fy": "+", "grip": "+", "shear": ""}
 
 
-def test_slip_adds_to_the_height_with_its_sign(case):
+def test_slip_adds_to_heights_with_its_sign(case):
     weight = case.blocks["block2"]["weight"][0]
     lifted = slip.stack(case.rig, 1.12 * weight / (2 * slip.GRIP), slip.LIGHT)
     landed = slip.stack(case.rig, 1.6 * weight / (2 * slip.GRIP), 1.5e-3)
     assert lifted.slip > 5e-4 and landed.slip < -5e-4
     for placed in (lifted, landed):
         assert placed.residual == pytest.approx(placed.slip, abs=1.5e-4)
-
-
-def test_recordings_with_slip_have_block_1_short_and_block_2_long():
     found = slip.heights(sources.recorded("grip_slip_1"))
-    assert found["block1"]["compliant"]["mean"] < -1e-4
-    assert found["block2"]["compliant"]["mean"] > 1e-4
+    assert found["block1"]["compliant"]["mean"] < -1e-4 and found["block2"]["compliant"]["mean"] > 1e-4
 
 
-def test_saved_numbers_are_those_of_the_recordings(case):
+def test_numbers_are_saved_as_recorded_without_nan_and_read_back(case, monkeypatch, tmp_path):
     saved = results.load("estimates")["table_4"]["recordings"]["paper"]
     fresh = estimates.by_formula(case)
     for which in ("one", "all"):
@@ -81,13 +70,17 @@ def test_saved_numbers_are_those_of_the_recordings(case):
                     fresh[which][name][key]["mean"], rel=1e-5
                 )
     assert results.load("states")["recordings"] == json.loads(json.dumps(recording.trials(case)))
+    monkeypatch.setattr(sources, "RESULTS", tmp_path)
+    sources.save("some", {"a": np.array([1.23456789, np.nan, -0.0]), "b": [{"c": True, "d": np.int64(3)}],
+                          "e": []})  # fmt: skip
+    text = (tmp_path / "some.json").read_text(encoding="utf-8")
+    read = json.loads(text)
+    assert read.pop("made_by", None) == commit_of()
+    assert read == {"a": [1.23457, None, 0.0], "b": [{"c": True, "d": 3}], "e": []}
 
 
-def test_the_page_is_rendered_from_the_results():
+def test_the_page_is_rendered_from_the_results_and_they_bear_out_its_words():
     assert write_docs.TARGET.read_text(encoding="utf-8") == write_docs.render()
-
-
-def test_what_the_page_claims_in_words():
     replay, slid, alike = (results.load(name) for name in ("replay", "slip", "alike"))
     for trial in replay["trials"]:
         assert max(trial["free-motion"], trial["hold-above-ground"]) <= replay["limit"]
@@ -97,17 +90,6 @@ def test_what_the_page_claims_in_words():
     bayes = results.load("rigid")["bayes"]
     for name, width in rigid.ACTUAL.items():
         assert width - bayes["rigid"][name]["mean"] > 20 * bayes["rigid"][name]["sd"]
-
-
-def test_results_are_written_without_nan_and_read_back(monkeypatch, tmp_path):
-    monkeypatch.setattr(sources, "RESULTS", tmp_path)
-    sources.save(
-        "some", {"a": np.array([1.23456789, np.nan, -0.0]), "b": [{"c": True, "d": np.int64(3)}], "e": []}
-    )
-    text = (tmp_path / "some.json").read_text(encoding="utf-8")
-    read = json.loads(text)
-    assert read.pop("made_by", None) == commit_of()
-    assert read == {"a": [1.23457, None, 0.0], "b": [{"c": True, "d": 3}], "e": []}
 
 
 @pytest.mark.parametrize("name", figures.FIGURES)

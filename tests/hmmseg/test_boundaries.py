@@ -38,22 +38,18 @@ from hmmseg.segmentation.posteriors import contacts
 
 WIDTH = 0.05
 NODES = (np.arange(POINTS) + 0.5) / POINTS * WIDTH
-SOME = [
-    Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
-    Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "impact"),
-    Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "landing", restless=0.01),
-    Crossing(-2e-4, 1e-3, 0.01, 0.05, 3e-6, 3e-5, 2e-3, "launch"),
-]
+SOME = [Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
+        Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "impact"),
+        Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "landing", restless=0.01),
+        Crossing(-2e-4, 1e-3, 0.01, 0.05, 3e-6, 3e-5, 2e-3, "launch")]  # fmt: skip
 
 
 def linear(root, speed, kind, sd=1e-7):
-    """Uniform motion with this speed that crosses zero at `root` [s]."""
     left = -speed * root
     if kind == "impact":  # stops dead after the touch, up to the pad's compression
         return Crossing(left, 0.15 * speed * (WIDTH - root), speed, 0.0, sd, sd, 1e-5, kind)
     if kind == "launch":  # from rest under load, constant jerk: a third of the speed on the mean
-        after = WIDTH - root
-        creep = 1e-3 * speed
+        after, creep = WIDTH - root, 1e-3 * speed
         return Crossing(-creep * root, (creep + (speed - creep) / 3) * after, 0.75 * creep, speed, sd, sd,
                         1e-5, kind)  # fmt: skip
     return Crossing(left, speed * (WIDTH - root), speed, speed, sd, sd, 1e-5)
@@ -102,21 +98,16 @@ def test_last_and_first_of_two_against_monte_carlo():
         np.testing.assert_allclose(found, (1 - UNIFORM) * expected + UNIFORM / POINTS, atol=5e-3)
 
 
-def test_quantiles_and_moments_of_a_known_distribution():
+def test_moments_are_of_the_distribution_and_without_knowledge_of_the_interval():
     times = np.linspace(-5, 5, 4001)
     density = np.exp(-0.5 * times**2)
     posterior = BoundaryPosterior(1.0 + 0.1 * times, density / density.sum())
-    assert posterior.mean == pytest.approx(1.0)
-    assert posterior.sd == pytest.approx(0.1, rel=1e-4)
+    assert posterior.mean == pytest.approx(1.0) and posterior.sd == pytest.approx(0.1, rel=1e-4)
     for q, z in ((0.05, -1.6449), (0.5, 0.0), (0.95, 1.6449)):
         assert posterior.quantile(q) == pytest.approx(1.0 + 0.1 * z, abs=1e-4)
-
-
-def test_where_nothing_more_is_known_a_boundary_is_anywhere_in_its_interval():
     t = np.array([0.0, 0.1, 0.2, 0.35, 0.4])
     posterior = evenly(t, np.array([0.0, 0.25, 0.75, 1e-9]))
-    assert (np.diff(posterior.times) >= 0).all()
-    assert posterior.probabilities.sum() == pytest.approx(1.0)
+    assert (np.diff(posterior.times) >= 0).all() and posterior.probabilities.sum() == pytest.approx(1.0)
     early = posterior.times < 0.2
     assert posterior.probabilities[early].sum() == pytest.approx(0.25, abs=5e-3)
     assert posterior.mean == pytest.approx(0.25 * 0.15 + 0.75 * 0.275, abs=1e-4)
@@ -126,7 +117,6 @@ def test_where_nothing_more_is_known_a_boundary_is_anywhere_in_its_interval():
 
 
 def coverage(draw, rng, num=600):
-    """Share of true roots inside the central 90 % interval, roots drawn by `draw(rng)`."""
     inside = 0
     for _ in range(num):
         root, crossing = draw(rng)
@@ -137,7 +127,6 @@ def coverage(draw, rng, num=600):
 
 
 def smooth_case(rng):
-    """Constant velocity, measured at both ends with noise; the root is uniform in the interval."""
     root, speed, sd, sd_v = rng.uniform(0, WIDTH), 0.05, 2e-4, 2e-3
     values = np.array([-speed * root, speed * (WIDTH - root)]) + sd * rng.normal(size=2)
     rates = speed + sd_v * rng.normal(size=2)
@@ -145,11 +134,7 @@ def smooth_case(rng):
 
 
 def touches(rng, width, num=1):
-    """Time at which all of `num` fingers that move as one have hit, and their crossings.
-
-    A minimum-jerk motion of log-uniform duration; each finger's face lies anywhere on its way, the
-    first finger's root is uniform in the interval.
-    """
+    """Time at which all of `num` fingers that move as one, by minimum jerk, have hit, and their crossings."""
     sd_left, sd_right, sd_v = 4e-5, 5e-6, 2e-3
     phases = np.linspace(0, 1, 10_001)
     at_hit = np.interp(rng.uniform(), _minimum_jerk(phases), phases)
@@ -164,21 +149,17 @@ def touches(rng, width, num=1):
         left = -distance * (_minimum_jerk(at_hit) - _minimum_jerk(phase))
         v_left = (1 + SHAPE * rng.normal()) * distance * _minimum_jerk_slope(phase) / duration
         stop, after = np.exp(rng.uniform(*np.log((0.002, 0.05)))), width - root
-        right = v * stop * -np.expm1(-after / stop)
-        noise = rng.normal(size=4)
+        right, noise = v * stop * -np.expm1(-after / stop), rng.normal(size=4)
         roots.append(root)
         # A sample interval before; drawn apart, so that what stands above is as it was.
-        phase_then, other = (
-            phase - width / duration,
-            np.random.default_rng(int(1e6 * root) + i).normal(size=3),
-        )
+        phase_then, other = (phase - width / duration,
+                             np.random.default_rng(int(1e6 * root) + i).normal(size=3))  # fmt: skip
         then = -distance * (_minimum_jerk(at_hit) - _minimum_jerk(phase_then)) + sd_left * other[0]
         v_then = (1 + SHAPE * other[1]) * distance * _minimum_jerk_slope(phase_then) / duration
-        crossings.append(Crossing(
-            left + sd_left * noise[0], right + sd_right * noise[1], v_left + sd_v * noise[2],
-            v * np.exp(-after / stop) + sd_v * noise[3], sd_left, sd_right, sd_v, "impact",
-            earlier=(width, then, v_then + sd_v * other[2]),
-        ))  # fmt: skip
+        crossings.append(Crossing(left + sd_left * noise[0], right + sd_right * noise[1],
+                                  v_left + sd_v * noise[2], v * np.exp(-after / stop) + sd_v * noise[3],
+                                  sd_left, sd_right, sd_v, "impact",
+                                  earlier=(width, then, v_then + sd_v * other[2])))  # fmt: skip
     return max(roots), crossings
 
 
@@ -293,7 +274,6 @@ def test_intervals_cover_a_landing_within_a_gap_that_does_not_stop_the_hand(gap)
 
 
 def sensed(p, sd_pressed=3e-6, sd_place=3e-5, seed=0, **others):
-    """A contact of known penetration, with noise."""
     rng = np.random.default_rng(seed)
     pressed = np.maximum(p, 0) + sd_pressed * rng.standard_normal(p.size)
     place = p + sd_place * rng.standard_normal(p.size)
@@ -359,14 +339,12 @@ SD_PRESSED, SD_PLACE = 3e-6, 2e-5
 
 
 def release(seed: int, slip: float | None = None) -> Change:
-    """A contact that ends between samples 5 and 6, relaxed; it slides where it is pressed by `slip` [m]."""
     rng = np.random.default_rng(seed)
     place = (5 - np.arange(12)) * 2e-4 + rng.uniform(0, 2e-4)
     pressed = np.where(np.arange(12) <= 5, np.maximum(place, 0), 0.0)
-    c = Penetration(
-        T, pressed + SD_PRESSED * rng.standard_normal(12), place + SD_PLACE * rng.standard_normal(12),
-        np.full((2, 12), -1e-2), SD_PRESSED, SD_PRESSED, SD_PLACE, 1e-3, 0.0,
-    )  # fmt: skip
+    c = Penetration(T, pressed + SD_PRESSED * rng.standard_normal(12),
+                    place + SD_PLACE * rng.standard_normal(12), np.full((2, 12), -1e-2), SD_PRESSED,
+                    SD_PRESSED, SD_PLACE, 1e-3, 0.0)  # fmt: skip
     probability = np.zeros(11)
     probability[5] = 1.0
     slips = () if slip is None else (slip,)
@@ -381,12 +359,10 @@ def test_a_grip_that_slides_before_it_ends_may_have_ended_then_and_another_ends_
     spent = float(np.interp(0.0, -place, T))
     found, plain = moment(change, known), moment(release(99), known)
     assert found.quantile(0.05) < slides + 2e-3 and found.quantile(0.95) > spent - 2e-3
-    assert plain.quantile(0.05) > slides + 10e-3
-    assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
+    assert plain.quantile(0.05) > slides + 10e-3 and abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
     for seed in range(90, 95):
         found, plain = moment(release(seed, slip=0.0), known), moment(release(seed), known)
-        assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 1e-3
-        assert found.sd < 1.5 * plain.sd
+        assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 1e-3 and found.sd < 1.5 * plain.sd
 
 
 def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():

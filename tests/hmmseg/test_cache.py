@@ -11,6 +11,22 @@ import pytest
 from hmmseg import cache
 from hmmseg.cache import CacheWarning, cache_folder, keep, kept
 
+PROGRAM = """
+import sys
+from hmmseg.jaxconfig import configure, double_precision
+configure()
+import jax, jax.numpy as jnp
+jax.monitoring.register_event_listener(lambda event, **_: print(event) if "cache_" in event else None)
+print(double_precision(lambda: jax.jit(lambda x: (x * x).sum())(jnp.arange(5.0)))())
+"""
+FUNCTION = """
+from hmmseg.online.compiled import compiled
+@compiled
+def double(x):
+    return 2 * x
+print(double(1.5), sum(double.stats.cache_hits.values()))
+"""
+
 
 @pytest.fixture(autouse=True)
 def unsaid(monkeypatch):
@@ -54,29 +70,16 @@ def test_without_a_home_nothing_is_kept_and_nothing_fails(where, tmp_path, monke
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / where) if where == "a file" else where)
     monkeypatch.setenv("HOME", "/proc/nowhere")
     folder = cache_folder()
-    assert folder is not None
     keep(folder / "one.json", b"1")
-    assert kept(folder / "one.json") is None
-    assert os.listdir(tmp_path) == ["a file"]
-
-
-PROGRAM = """
-import sys
-from hmmseg.jaxconfig import configure, double_precision
-configure()
-import jax, jax.numpy as jnp
-jax.monitoring.register_event_listener(lambda event, **_: print(event) if "cache_" in event else None)
-print(double_precision(lambda: jax.jit(lambda x: (x * x).sum())(jnp.arange(5.0)))())
-"""
+    assert kept(folder / "one.json") is None and os.listdir(tmp_path) == ["a file"]
 
 
 def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
 
     def run():
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True
-        )
+        done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True,
+                              text=True)  # fmt: skip
         assert done.stdout.endswith("30.0\n")
         return "cache_hits" in done.stdout, done.stderr
 
@@ -90,17 +93,7 @@ def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp
         content[len(content) // 2] ^= 0xFF
         program.write_bytes(content)
     hit, said = run()
-    assert programs and not hit and said.count("not as it was written") == 1
-    assert run() == (True, "")
-
-
-FUNCTION = """
-from hmmseg.online.compiled import compiled
-@compiled
-def double(x):
-    return 2 * x
-print(double(1.5), sum(double.stats.cache_hits.values()))
-"""
+    assert programs and not hit and said.count("not as it was written") == 1 and run() == (True, "")
 
 
 def test_functions_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
@@ -112,12 +105,10 @@ def test_functions_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
         done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True)
         return done.stdout.strip(), "not as it was written" in done.stderr
 
-    assert run() == ("3.0 0", False)
-    assert run() == ("3.0 1", False)
+    assert run() == ("3.0 0", False) and run() == ("3.0 1", False)
     for kind in "nbi", "nbc":
         (file,) = (tmp_path / "hmmseg/numba").rglob(f"*.{kind}")
         content = bytearray(file.read_bytes())
         content[len(content) // 2] ^= 0xFF
         file.write_bytes(content)
-        assert run() == ("3.0 0", True)
-        assert run() == ("3.0 1", False)
+        assert run() == ("3.0 0", True) and run() == ("3.0 1", False)

@@ -27,12 +27,20 @@ from hmmseg.segmentation.fit import (
     otsu,
 )
 
-STACK = BlockTask(
-    {"block1": "block2", "block2": "ground"}, (Move("block1", "ground"), Move("block2", "block1"))
-)
+STACK = BlockTask({"block1": "block2", "block2": "ground"},
+                  (Move("block1", "ground"), Move("block2", "block1")))  # fmt: skip
 STEPS = subtasks(STACK)
 GRAVITY, COMPLIANCE, SQUEEZE = 9.81, 2e-4, 2.5e-4
 PADS = Pads(SQUEEZE, SQUEEZE, 2 * COMPLIANCE, 2 * COMPLIANCE)
+LEVELS = {1: 0.022, 3: 0.008, 5: 0.006, 7: 0.02}
+PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
+SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
+SPAN = {"vx": 0.4, "vy": 0.3, "y": 0.06, "d": 0.04, "force": 6.0, "press": 6.0}
+PARAMETERS = Parameters(bias=np.array([0.02, -0.01, 0.0, 0.03]), weight={"block": 0.4}, width={"block": 0.02},
+                        scale={"force": 0.01, "carry": 0.02, "net_x": 0.05, "shear": 0.05, "velocity": 0.003,
+                               "level": 1e-4, "width": 1e-4},
+                        levels=({1: 0.01, 2: 0.01, 3: 0.01},))  # fmt: skip
+STAY = 0.8
 
 
 @dataclass(frozen=True)
@@ -44,7 +52,6 @@ class Planted:
 
 
 PLANTED = Planted()
-LEVELS = {1: 0.022, 3: 0.008, 5: 0.006, 7: 0.02}
 
 
 def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
@@ -78,32 +85,26 @@ def planted(seed: int, planted: Planted = PLANTED, dt: float = 0.05):
         force[inside] += np.stack([grip, fy / 2, -grip, fy / 2], axis=1)
     spans = {"vx": np.ptp(vx), "vy": np.ptp(vy), "y": np.ptp(y), "d": np.ptp(d), "force": 6.0, "press": 6.0}
     noises = {"sd_y": 5e-5, "sd_d": 6e-5, "sd_vx": 2e-3, "sd_vy": 2e-3}
-    f = Features(
-        t=np.arange(num) * dt, force=force, vx=vx, vy=vy, ay=ay, y=y, d=d,
-        **{k: np.full(num, v) for k, v in noises.items()}, pads=PADS,
-        gravity=GRAVITY, span={k: float(v) for k, v in spans.items()},
-    )  # fmt: skip
+    f = Features(t=np.arange(num) * dt, force=force, vx=vx, vy=vy, ay=ay, y=y, d=d,
+                 **{k: np.full(num, v) for k, v in noises.items()}, pads=PADS, gravity=GRAVITY,
+                 span={k: float(v) for k, v in spans.items()})  # fmt: skip
     return f, labels
 
 
-PICK = BlockTask({"block": "ground"}, (Move("block", "ground"),))
-SLIDE = BlockTask({"block": "ground"}, (Move("block", "ground", slide=True),))
-SPAN = {"vx": 0.4, "vy": 0.3, "y": 0.06, "d": 0.04, "force": 6.0, "press": 6.0}
-PARAMETERS = Parameters(
-    bias=np.array([0.02, -0.01, 0.0, 0.03]), weight={"block": 0.4}, width={"block": 0.02},
-    scale={"force": 0.01, "carry": 0.02, "net_x": 0.05, "shear": 0.05, "velocity": 0.003,
-           "level": 1e-4, "width": 1e-4},
-    levels=({1: 0.01, 2: 0.01, 3: 0.01},),
-)  # fmt: skip
-
-
-def test_edges_are_students_distribution_far_into_their_tails():
+def test_students_edges_are_exact_and_em_ends_at_the_maximum_of_the_evidence():
     z = np.array([-1e5, -60.0, -4.0, -0.3, 0.0, 0.3, 4.0, 60.0])
     np.testing.assert_allclose(log_student_below(z), stats.t.logcdf(z, TAIL), rtol=1e-12, atol=1e-15)
+    rng = np.random.default_rng(0)
+    sizes = ((3, 6), (4, 5), (6, 3), (2, 3))
+    trials = [np.r_[rng.normal(size=before), rng.normal(2.0, 1.0, size=after)] for before, after in sizes]
+    fit = learn_level(trials, 0.7, max_iterations=500, tolerance=1e-10)
+    assert fit.converged
+    best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
+    assert fit.model == pytest.approx(best.x, abs=1e-3)
+    assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.model), abs=1e-9)
 
 
 def features(num, **columns):
-    """Features of `num` samples, columns by name (scalar or array)."""
     blank = {name: np.zeros(num) for name in ("vx", "vy", "ay", "y", "d")}
     values = {name: np.broadcast_to(np.asarray(v, float), (num,)) for name, v in columns.items()
               if name != "force"}  # fmt: skip
@@ -126,20 +127,17 @@ def score(f: Features, state: str) -> np.ndarray:
 def test_ungripped_force_density_integrates_to_one():
     # Importance sampling with a proposal of the same three parts, heavier at the edges.
     rng, num, scale, span = np.random.default_rng(0), 400_000, 0.1, 6.0
-    part = rng.integers(3, size=num)
-    silent = stats.t(3, scale=0.15)
+    part, silent = rng.integers(3, size=num), stats.t(3, scale=0.15)
     x = silent.rvs(size=(num, 4), random_state=rng)
     wide = np.stack([rng.uniform(-1, 7, num), rng.uniform(-7, 7, num)], axis=1)
     x[part == 1, :2] = wide[part == 1]
     mirrored = wide * np.array([-1.0, 1.0])
     x[part == 2, 2:] = mirrored[part == 2]
-    quiet = silent.logpdf(x)
-    box = -np.log(8.0 * 14.0)
+    quiet, box = silent.logpdf(x), -np.log(8.0 * 14.0)
     one = np.where((x[:, 0] > -1) & (x[:, 0] < 7) & (np.abs(x[:, 1]) < 7), box, -np.inf)
     two = np.where((x[:, 2] < 1) & (x[:, 2] > -7) & (np.abs(x[:, 3]) < 7), box, -np.inf)
-    proposal = np.logaddexp.reduce(
-        [quiet.sum(axis=1), one + quiet[:, 2:].sum(axis=1), quiet[:, :2].sum(axis=1) + two]
-    ) - np.log(3)
+    proposal = np.logaddexp.reduce([quiet.sum(axis=1), one + quiet[:, 2:].sum(axis=1),
+                                    quiet[:, :2].sum(axis=1) + two]) - np.log(3)  # fmt: skip
     ratio = np.exp(_log_ungripped(x, scale, span, 0.0) - proposal)
     assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(num) + 1e-3
 
@@ -182,30 +180,22 @@ def test_a_sample_without_values_says_nothing(state):
     np.testing.assert_allclose(score(f, state), np.zeros(3), atol=1e-12)
 
 
-def test_a_block_held_still_above_its_place_is_not_at_rest_on_it():
-    """However long it is held: it hangs by its weight, and 4 mm from where the block rests."""
+def test_a_block_held_still_above_its_place_hangs_by_its_weight_and_inertia():
     still = PARAMETERS.bias + np.array([2.0, 0.2, -2.0, 0.2])
     hover = features(200, force=still, d=0.019, y=0.014 + 0.4 * 2e-4)
     assert score(hover, ABOVE_GROUND).sum() > score(hover, ON_GROUND).sum() + 200
     unknown = replace(PARAMETERS, levels=({1: 0.014},))  # the level may have been learned from the hover
     learned = log_likelihoods(hover, step(ON_GROUND), unknown, 0)[:, 0]
     assert score(hover, ABOVE_GROUND).sum() > learned.sum()
-
-
-def test_a_block_that_is_pushed_on_the_ground_is_still_on_it():
-    resting = PARAMETERS.bias + np.array([2.0, 0.15, -2.0, 0.15])
-    pushed = features(10, force=resting, d=0.019, y=0.01 + 0.3 * 2e-4, vx=0.03)
-    assert score(pushed, ON_GROUND).sum() > score(pushed, ABOVE_GROUND).sum() + 20
-
-
-def test_weight_of_a_carried_block_includes_its_inertia():
     force = PARAMETERS.bias + np.array([2.0, 0.3, -2.0, 0.3])  # 0.6 N: 0.4 N at half a g upwards
     still, rising = (score(features(1, force=force, d=0.019, ay=a), ABOVE_GROUND)[0] for a in (0.0, 4.905))
     assert rising > still + 5
 
 
-def test_what_strays_on_its_support_stays_near_it():
-    """A bounce or a slip by 3 mm may be; a rise by 25 mm is neither, however its forces ring."""
+def test_what_strays_on_its_support_is_on_it_while_it_stays_near_it():
+    resting = PARAMETERS.bias + np.array([2.0, 0.15, -2.0, 0.15])
+    pushed = features(10, force=resting, d=0.019, y=0.01 + 0.3 * 2e-4, vx=0.03)
+    assert score(pushed, ON_GROUND).sum() > score(pushed, ABOVE_GROUND).sum() + 20
     ring = PARAMETERS.bias + np.array([2.0, -0.05, -2.0, -0.05])
     off = np.array([0.003, 0.025])
     moving = features(2, force=ring, d=0.019, y=0.01 - 0.1 * 2e-4 + off, vy=0.1)
@@ -217,9 +207,8 @@ def test_what_strays_on_its_support_stays_near_it():
 def test_otsu_against_trying_every_split():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        values = np.concatenate(
-            [rng.normal(0, 1, rng.integers(3, 30)), rng.normal(6, 2, rng.integers(3, 30))]
-        )
+        values = np.concatenate([rng.normal(0, 1, rng.integers(3, 30)),
+                                 rng.normal(6, 2, rng.integers(3, 30))])  # fmt: skip
         v = np.sort(values)
 
         def between(i, v=v):
@@ -233,8 +222,7 @@ def test_otsu_against_trying_every_split():
 
 def test_location_and_scale_maximise_the_weighted_student_likelihood():
     rng = np.random.default_rng(1)
-    values = 3.0 + 0.2 * rng.standard_t(3, size=400)
-    weights = rng.uniform(size=400)
+    values, weights = 3.0 + 0.2 * rng.standard_t(3, size=400), rng.uniform(size=400)
 
     def loss(p):
         return -weights @ stats.t.logpdf(values, TAIL, loc=p[0], scale=np.exp(p[1]))
@@ -249,12 +237,20 @@ def test_location_and_scale_maximise_the_weighted_student_likelihood():
     assert found == pytest.approx(np.exp(at_location.x), rel=0.02)
 
 
-def test_transitions_are_probabilities_with_the_mean_duration():
+def test_shares_are_the_mean_of_their_dirichlet_and_transitions_have_the_mean_duration():
     stay, advance = chain_of(np.array([0.25, 0.5, 0.25]), 200).bands
     np.testing.assert_allclose(np.exp(stay[:2]) + np.exp(advance), 1.0)
     np.testing.assert_allclose(np.exp(-advance), [50, 100])
     stay, advance = chain_of(np.array([1e-9, 1.0]), 5).bands
     assert np.isfinite(stay).all() and np.isfinite(advance).all()
+    rng = np.random.default_rng(5)
+    gammas = [rng.dirichlet(np.ones(4), size=n) * [1, 1, 1, 0] for n in (30, 50)]  # a subtask nobody saw
+    gammas = [g / g.sum(axis=1, keepdims=True) for g in gammas]
+    counts = sum(g.mean(axis=0) for g in gammas)
+    expected = stats.dirichlet(np.full(4, 1 / 4) + counts).mean()
+    found = mean_shares(gammas)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert found[3] > 0
 
 
 def check_recovery(found, trials):
@@ -298,22 +294,7 @@ def test_a_scale_is_not_learned_from_readings_that_rounding_makes_equal():
     assert _least_force([trial]) < 0.3 * PLANTED.noise
 
 
-def test_shares_of_a_trial_are_the_mean_of_their_dirichlet_posterior():
-    rng = np.random.default_rng(5)
-    gammas = [rng.dirichlet(np.ones(4), size=n) * [1, 1, 1, 0] for n in (30, 50)]  # a subtask nobody saw
-    gammas = [g / g.sum(axis=1, keepdims=True) for g in gammas]
-    counts = sum(g.mean(axis=0) for g in gammas)
-    expected = stats.dirichlet(np.full(4, 1 / 4) + counts).mean()
-    found = mean_shares(gammas)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    assert found[3] > 0
-
-
-STAY = 0.8
-
-
 def learn_level(trials, start, **settings):
-    """EM of two unit-variance levels, the first known to be 0."""
     chain = Chain(np.log([STAY, 1.0]), np.log([1 - STAY]))
 
     def tables(level):
@@ -332,24 +313,6 @@ def by_enumeration(trials, level):
     for x in trials:
         terms = [
             norm.logpdf(x[:cut]).sum() + norm.logpdf(x[cut:], level).sum() + (cut - 1) * np.log(STAY)
-            + np.log(1 - STAY) for cut in range(1, x.size)
-        ]  # fmt: skip
+            + np.log(1 - STAY) for cut in range(1, x.size)]  # fmt: skip
         total += np.logaddexp.reduce(terms)
     return total
-
-
-def recorded():
-    rng = np.random.default_rng(0)
-    return tuple(
-        np.r_[rng.normal(size=before), rng.normal(2.0, 1.0, size=after)]
-        for before, after in ((3, 6), (4, 5), (6, 3), (2, 3))
-    )
-
-
-def test_em_ends_at_the_maximum_of_the_evidence():
-    trials = recorded()
-    fit = learn_level(trials, 0.7, max_iterations=500, tolerance=1e-10)
-    assert fit.converged
-    best = optimize.minimize_scalar(lambda at: -by_enumeration(trials, at), bounds=(-1, 4), method="bounded")
-    assert fit.model == pytest.approx(best.x, abs=1e-3)
-    assert fit.log_evidence == pytest.approx(by_enumeration(trials, fit.model), abs=1e-9)

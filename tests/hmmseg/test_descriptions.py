@@ -3,37 +3,37 @@
 import math
 
 import pytest
+from refusals import refused
 
-from hmmseg.errors import InputError
 from hmmseg.io.rig import Rig, parse_rig, read_rig
 from hmmseg.io.task import BlockTask, Move, SequenceTask, parse_task, read_task
 
 FINGER = {"base": [0.05, 0.17], "links": [0.12, 0.12]}
 HAND = {"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.21, 0.17]}}}
+STACK = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
+SWAP = [{"object": "block1", "to": "ground"}, {"object": "block2", "to": "block1"}]
+BACK = [{"object": "a", "to": "b"}, {"object": "a", "to": "ground"}]
+GRIPPERS = [
+    ({"frame": "base"}, "key gripper.frame: "),
+    ({"wrench": ["fx"]}, "key gripper.wrench: has 1 columns; expected 3 forces"),
+    ({"mass": 1}, r"key gripper.mass: unknown key; .*tool_mass\?"),
+    ({"sensor_axes": ["x", "y", "-z"]}, ".*gripper.sensor_axes: x, y, -z are no right-handed axes"),
+    ({"position": {"x": "a", "y": "b"}}, ".*position has no column for z, the axis that is up"),
+    ({"force_per_ampere": 3.0}, ".*force_per_ampere without motor_current"),
+    ({"grip_force": 1e308}, "key gripper.grip_force")]  # fmt: skip
 
 
-def test_what_is_left_out_has_its_default():
+def test_uncertainty_gripper_and_tolerance_are_read_and_what_is_left_out_has_its_default():
     rig = parse_rig({})
-    assert rig == Rig()
-    assert not rig.jointed
-    assert rig.gravity == 9.80665
-    assert math.isinf(rig.fingertip.normal_stiffness)
-    assert rig.noise.force is None
+    assert rig == Rig() and not rig.jointed and rig.gravity == 9.80665
+    assert math.isinf(rig.fingertip.normal_stiffness) and rig.noise.force is None
     with pytest.raises(ValueError, match="a Cartesian hand has no fingers"):
         rig.finger(1)
-
-
-def test_systematic_uncertainty_by_number_list_or_name():
     rig = parse_rig({"systematic": {"force_bias": 0.01, "force_gain": [0.1, 0.2, 0.3, 0.4],
                                     "joint_offset": {"q12": 0.002}, "pad_stiffness": 1}})  # fmt: skip
-    assert rig.systematic.force_bias == (0.01,) * 4
-    assert rig.systematic.force_gain == (0.1, 0.2, 0.3, 0.4)
+    assert rig.systematic.force_bias == (0.01,) * 4 and rig.systematic.force_gain == (0.1, 0.2, 0.3, 0.4)
     assert rig.systematic.joint_offset == (0.0, 0.002, 0.0, 0.0)
-    assert rig.systematic.pad_stiffness == (1.0, 1.0)
-    assert rig.systematic.link_length == (0.0,) * 4
-
-
-def test_gripper_and_tolerance():
+    assert rig.systematic.pad_stiffness == (1.0, 1.0) and rig.systematic.link_length == (0.0,) * 4
     rig = parse_rig({"tolerance": {"position": 1e-3}, "gripper": {"opening": "width", "tool_mass": 0.5}})
     assert (rig.tolerance.position, rig.tolerance.property) == (1e-3, None)
     assert rig.gripper.channels[:4] == ("x", "y", "z", "width") and rig.gripper.tool_mass == 0.5
@@ -41,23 +41,16 @@ def test_gripper_and_tolerance():
 
 REFUSED = [
     ({"speed": 1}, r"rig: key speed: unknown key; expected one of .*rate.* \(did you mean"),
-    ({"noise": {"forse": 1}}, r"rig: key noise.forse: unknown key; .*did you mean force"),
-    ({"fingertip": {"stiffness": 1}}, r"rig: key fingertip.stiffness: unknown key; .*normal_stiffness"),
-    ({"systematic": {"bias": 1}}, r"rig: key systematic.bias: unknown key; .*did you mean force_bias"),
     ({"fingers": {"1": {**FINGER, "length": 1}, "2": FINGER}},
      r"rig: key fingers.1.length: unknown key; .*links"),
     ({"fingers": {"1": FINGER}}, r"rig: fingers must be the two tables \[fingers.1\] and \[fingers.2\]"),
     ({"fingers": {"1": FINGER, "2": {"base": [0, 0]}}}, "rig: key fingers.2.links: missing"),
-    ({"fingers": {"1": FINGER, "2": {**FINGER, "links": [0.1]}}}, r"rig: key fingers.2.links.1: missing"),
     ({"fingers": {"1": FINGER, "2": {**FINGER, "links": [0.1, -0.1]}}},
      r"rig: key fingers.2.links.1: .*greater than 0 \(found -0.1\)"),
     ({"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.1, math.nan]}}},
      r"rig: key fingers.2.base.1: .*finite"),
     ({"rate": 0}, r"rig: key rate: Input should be greater than 0 \(found 0"),
-    ({"rate": "20"}, r"rig: key rate: Input should be a valid number \(found '20'\)"),
     ({"rate": True}, r"rig: key rate: Input should be a valid number \(found True\)"),
-    ({"rate": math.nan}, r"rig: key rate: .*finite"),
-    ({"gravity": math.inf}, r"rig: key gravity: .*finite"),
     ({"gravity": 980.665}, r"rig: key gravity: .*less than or equal to 100"),
     ({"fingers": {"1": FINGER, "2": {**FINGER, "links": [120, 120]}}},
      r"rig: key fingers.2.links.0: .*less than or equal to 10 \(found 120"),
@@ -77,69 +70,36 @@ REFUSED = [
     ({"columns": {"x1": {"from": "a", "sing": 1}}},
      r"rig: key columns.x1.sing: unknown key; .*did you mean sign\?"),
     ({"columns": {"x1": {"from": "a", "sign": 2}}}, "rig: key columns.x1.sign: found 2; expected 1 or -1"),
-    ({"columns": {"x1": {"from": "a", "offset": math.nan}}}, "rig: key columns.x1.offset: .*finite"),
     ({"columns": {"x1": {"from": ""}}}, "rig: key columns.x1.from: .*at least 1 character"),
     ({"columns": {"x1": 3}}, "rig: key columns.x1: "),
     ({"columns": {"x1": {"unit": -1.0}}}, "rig: key columns.x1.unit"),
     ({"columns": {"t": {"unit": "mm"}}}, "rig: key columns: t is a time, but its unit mm is one of length"),
     ({"columns": {"fx1": {"unit": "deg"}}},
      "rig: key columns: fx1 is a force, but its unit deg is one of angle"),
-    ({"tolerance": {"lenght": 1}}, r"rig: key tolerance.lenght: unknown key; expected one of force, pos"),
-    ({"tolerance": {"force": 0}}, "rig: key tolerance.force: .*greater than 0"),
-    ({"gripper": {}}, r"rig: a hand has \[fingers\] or is a \[gripper\], not both"),
-]  # fmt: skip
-GRIPPERS = [
-    ({"frame": "base"}, "key gripper.frame: "),
-    ({"wrench": ["fx"]}, "key gripper.wrench: has 1 columns; expected 3 forces"),
-    ({"mass": 1}, r"key gripper.mass: unknown key; .*tool_mass\?"),
-    ({"sensor_axes": ["x", "y", "-z"]}, ".*gripper.sensor_axes: x, y, -z are no right-handed axes"),
-    ({"position": {"x": "a", "y": "b"}}, ".*position has no column for z, the axis that is up"),
-    ({"force_per_ampere": 3.0}, ".*force_per_ampere without motor_current"),
-    ({"grip_force": 1e308}, "key gripper.grip_force"),
-]  # fmt: skip
+    ({"gripper": {}}, r"rig: a hand has \[fingers\] or is a \[gripper\], not both")]  # fmt: skip
 
 
 @pytest.mark.parametrize(("table", "message"), [
     *(({**HAND, **table}, message) for table, message in REFUSED),
-    *(({"gripper": table}, f"rig: {message}") for table, message in GRIPPERS),
-])  # fmt: skip
+    *(({"gripper": table}, f"rig: {message}") for table, message in GRIPPERS)])  # fmt: skip
 def test_refused_with_its_message(table, message):
-    with pytest.raises(InputError, match=f"^{message}") as caught:
-        parse_rig(table)
-    assert "\n" not in str(caught.value)
+    refused(f"^{message}", parse_rig, table)
 
 
-STACK = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
-SWAP = [{"object": "block1", "to": "ground"}, {"object": "block2", "to": "block1"}]
-BACK = [{"object": "a", "to": "b"}, {"object": "a", "to": "ground"}]
-
-
-def test_reads_blocks_and_moves(tmp_path):
+def test_reads_blocks_moves_repeats_and_plain_sequences(tmp_path):
     path = tmp_path / "task.toml"
-    path.write_text(
-        '[objects.block1]\non = "block2"\n[objects.block2]\non = "ground"\n'
-        '[[moves]]\nobject = "block1"\nto = "ground"\n'
-        '[[moves]]\nobject = "block1"\nto = "ground"\nslide = true\n'
-    )
+    path.write_text('[objects.block1]\non = "block2"\n[objects.block2]\non = "ground"\n'
+                    '[[moves]]\nobject = "block1"\nto = "ground"\n'
+                    '[[moves]]\nobject = "block1"\nto = "ground"\nslide = true\n')  # fmt: skip
     task = read_task(path)
-    assert task == BlockTask(
-        {"block1": "block2", "block2": "ground"},
-        (Move("block1", "ground"), Move("block1", "ground", slide=True)),
-    )
+    assert task == BlockTask({"block1": "block2", "block2": "ground"},
+                             (Move("block1", "ground"), Move("block1", "ground", slide=True)))  # fmt: skip
     assert task.objects == ("block1", "block2")
-
-
-def test_repeat_writes_the_moves_out():
     table = {"objects": {"a": {"on": "ground"}, "b": {"on": "ground"}}, "moves": BACK, "repeat": 3}
     task = parse_task(table)
-    assert isinstance(task, BlockTask)
-    assert task.performed == task.moves * 3
+    assert isinstance(task, BlockTask) and task.performed == task.moves * 3
     unknown = parse_task({**table, "repeat": "unknown"})
-    assert isinstance(unknown, BlockTask)
-    assert unknown.performed == unknown.moves
-
-
-def test_reads_a_plain_sequence():
+    assert isinstance(unknown, BlockTask) and unknown.performed == unknown.moves
     table = {"sequence": ["a", "b", "a"], "channels": ["fx"], "optional": ["b"]}
     assert parse_task(table) == SequenceTask(("a", "b", "a"), ("fx",), ("b",))
     assert parse_task({"sequence": ["a"]}) == SequenceTask(("a",))
@@ -153,16 +113,14 @@ def move(**entry):
     return blocks(moves=[entry])
 
 
-TASKS_REFUSED = [
+@pytest.mark.parametrize(("table", "message"), [
     (blocks(move=[]), "task: key move: unknown key; expected one of channels, moves, objects, optional, "
      r"repeat, sequence \(did you mean moves\?\)"),
     (blocks(sequence=["a"]), "task: key moves: does not go with `sequence`"),
     (blocks(channels=["fx"]), "task: key channels: goes only with `sequence`"),
     ({}, r"task: key objects: missing or empty; expected a table \[objects.NAME\] for every block"),
-    (blocks(objects={}), "task: key objects: missing or empty"),
     (blocks(objects=["block1"]), "task: key objects: missing or empty"),
     ({"objects": STACK}, r"task: key moves: missing or empty; expected at least one \[\[moves\]\]"),
-    (blocks(moves=[]), "task: key moves: missing or empty"),
     (blocks(moves={"object": "block1"}), "task: key moves: missing or empty"),
     (blocks(objects={"ground": {"on": "ground"}}), "task: key objects.ground: 'ground' is always there"),
     (blocks(objects={"finger1": {"on": "ground"}}), "task: key objects.finger1: 'finger1' is always there"),
@@ -181,7 +139,6 @@ TASKS_REFUSED = [
     (blocks(repeat=0), 'task: key repeat: found 0; expected a whole number from 1 to 1000 or "unknown"'),
     (blocks(repeat=2.0), "task: key repeat: found 2.0"),
     (blocks(repeat=True), "task: key repeat: found True"),
-    (blocks(repeat="often"), "task: key repeat: found 'often'"),
     (blocks(repeat=10**9), "task: key repeat: found 1000000000"),
     (blocks(moves=["block1"]), "task: move 1: found 'block1'; expected a table with object and to"),
     (move(object="block1", too="ground"), "task: move 1: key too: unknown key; .*did you mean to"),
@@ -210,14 +167,9 @@ TASKS_REFUSED = [
     ({"sequence": ["a"], "channels": ["f", "f"]}, "task: key channels: empty or repeated; expected distinct"),
     ({"sequence": ["a", "b"], "optional": ["c"]}, "task: key optional: 'c' is not in sequence; .* a, b"),
     ({"sequence": ["a", "b"], "optional": ["a", "b"]}, "task: key optional: covers all of sequence"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("table", "message"), TASKS_REFUSED)
+])  # fmt: skip
 def test_a_task_refused_with_its_message(table, message):
-    with pytest.raises(InputError, match=f"^{message}") as caught:
-        parse_task(table)
-    assert "\n" not in str(caught.value)
+    refused(f"^{message}", parse_task, table)
 
 
 @pytest.mark.parametrize("read", [read_rig, read_task])
@@ -226,11 +178,7 @@ def test_a_file_that_is_absent_or_malformed(read, tmp_path):
     assert read_task(tmp_path / "marked.toml").sequence == ("a", "b")
     (tmp_path / "bad.toml").write_text("moves = [")
     (tmp_path / "latin.toml").write_bytes(b'sequence = ["\xe9"]')
-    for name, line in (
-        ("absent.toml", r"absent\.toml: no such file; expected a TOML file"),
-        ("bad.toml", r"bad\.toml: not valid TOML: "),
-        ("latin.toml", r"latin\.toml: cannot be read"),
-        (".", "cannot be read"),
-    ):
-        with pytest.raises(InputError, match=line):
-            read(tmp_path / name)
+    for name, line in (("absent.toml", r"absent\.toml: no such file; expected a TOML file"),
+                       ("bad.toml", r"bad\.toml: not valid TOML: "),
+                       ("latin.toml", r"latin\.toml: cannot be read"), (".", "cannot be read")):  # fmt: skip
+        refused(line, read, tmp_path / name)

@@ -1,4 +1,4 @@
-"""The library hmmseg.hmm on plain arrays, against enumeration of every path."""
+"""The library hmmseg.hmm: chains, streams and tables of durations, against enumeration of every path."""
 
 import itertools
 import pickle
@@ -30,33 +30,20 @@ def test_every_quantity_matches_enumeration(size, single):
         ll = ll.astype(np.float32)
     paths, weights, log_evidence, smoothed, moves = brute(ll.astype(float), bands)
     chain = chain_of(bands)
-
     best = hmm.viterbi(ll, chain)
     assert best.path.tolist() == paths[weights.argmax()].tolist()
     np.testing.assert_allclose(best.log_prob, weights.max(), rtol=1e-12)
-
     posterior = hmm.smooth(ll, chain)
     np.testing.assert_allclose(posterior.log_evidence, log_evidence, rtol=1e-12)
     np.testing.assert_allclose(posterior.smoothed, smoothed, atol=1e-12)
     assert len(posterior.moves) == len(moves)
     for ours, theirs in zip(posterior.moves, moves, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)
-    np.testing.assert_allclose(hmm.log_evidence(ll, chain), log_evidence, rtol=1e-12)
-
-    ranked = hmm.k_best(ll, chain, 7)
-    order = np.argsort(-weights)[:7]
+    for found in (hmm.log_evidence(ll, chain), hmm.filter(ll, chain).log_evidence):
+        np.testing.assert_allclose(found, log_evidence, rtol=1e-12)
+    ranked, order = hmm.k_best(ll, chain, 7), np.argsort(-weights)[:7]
     np.testing.assert_allclose(ranked.log_prob, weights[order], rtol=1e-12)
     assert [a.path.tolist() for a in ranked] == paths[order].tolist()
-
-
-@pytest.mark.parametrize("num_skips", [0, 1])
-def test_filtered_probabilities_are_posteriors_of_every_prefix(num_skips):
-    ll, bands = random_problem(7, 3, seed=3, num_skips=num_skips)
-    found = hmm.filter(ll, chain_of(bands))
-    np.testing.assert_allclose(found.log_evidence, brute(ll, bands)[2])
-    for t in range(7):
-        smoothed = brute(ll[: t + 1], tuple(band[:t] for band in bands), final=np.zeros(3))[3]
-        np.testing.assert_allclose(found.filtered[t], smoothed[-1], atol=1e-12)
 
 
 @pytest.mark.parametrize("num_skips", [0, 1])
@@ -78,7 +65,7 @@ def test_draws_have_the_exact_path_probabilities(num_skips):
     assert chisquare(observed, wanted * observed.sum() / wanted.sum()).pvalue > 1e-3
 
 
-def test_open_ends_and_transitions_that_do_not_vary():
+def test_open_ends_and_boundaries_with_their_intervals_match_enumeration():
     ll, bands = random_problem(6, 3, seed=4)
     ends = {"initial": np.array([0.0, -1.0, -2.0]), "final": np.array([-3.0, 0.5, 0.0])}
     rows = [band[0] for band in bands]
@@ -89,6 +76,16 @@ def test_open_ends_and_transitions_that_do_not_vary():
         np.testing.assert_allclose(posterior.log_evidence, log_evidence)
         np.testing.assert_allclose(posterior.smoothed, smoothed, atol=1e-12)
         assert hmm.viterbi(ll, each).path.tolist() == paths[weights.argmax()].tolist()
+    ll, bands = random_problem(8, 3, seed=9)
+    paths, weights, log_evidence, *_ = brute(ll, bands)
+    p = np.exp(weights - log_evidence)
+    starts = np.array([[np.argmax(path >= k) for k in (1, 2)] for path in paths])
+    chain = chain_of(bands)
+    for level in (0.5, 0.9):
+        ends = [(1 - level) / 2, (1 + level) / 2]
+        expected = [[min(s for s in range(1, 8) if p[starts[:, k] <= s].sum() >= q) for q in ends]
+                    for k in (0, 1)]  # fmt: skip
+        assert hmm.smooth(ll, chain).start_intervals(level).tolist() == expected
 
 
 @pytest.mark.parametrize(("num_states", "num_skips", "varying"), [(1, 0, False), (4, 0, True), (5, 1, False)])
@@ -108,7 +105,7 @@ def test_in_parallel_in_time_is_the_same(num_states, num_skips, varying):
     np.testing.assert_allclose(rows.boundary, scan.boundary, atol=1e-10)
 
 
-def test_missing_samples_are_no_evidence():
+def test_missing_samples_are_no_evidence_and_nothing_underflows_or_overflows():
     ll, bands = random_problem(7, 3, seed=5)
     gone = ll.copy()
     gone[2:4] = np.nan
@@ -121,9 +118,6 @@ def test_missing_samples_are_no_evidence():
         for function in (hmm.viterbi, hmm.smooth, hmm.log_evidence):
             with pytest.raises(ValueError, match=r"log_likelihoods: NaN or \+inf at \[5, 1\]"):
                 function(ll, chain)
-
-
-def test_nothing_underflows_or_overflows():
     rng = np.random.default_rng(1)
     ll = rng.normal(size=(5000, 4))
     ll[rng.integers(0, 5000, 200), rng.integers(0, 4, 200)] = -1250.0  # samples fifty sigma away
@@ -162,19 +156,6 @@ def test_recordings_of_many_lengths_equal_one_by_one(single):
         align(bad, [chain] * len(bad))
 
 
-def test_boundaries_come_with_their_intervals():
-    ll, bands = random_problem(8, 3, seed=9)
-    paths, weights, log_evidence, *_ = brute(ll, bands)
-    p = np.exp(weights - log_evidence)
-    starts = np.array([[np.argmax(path >= k) for k in (1, 2)] for path in paths])
-    chain = chain_of(bands)
-    for level in (0.5, 0.9):
-        ends = [(1 - level) / 2, (1 + level) / 2]
-        expected = [[min(s for s in range(1, 8) if p[starts[:, k] <= s].sum() >= q) for q in ends]
-                    for k in (0, 1)]  # fmt: skip
-        assert hmm.smooth(ll, chain).start_intervals(level).tolist() == expected
-
-
 def test_optional_states_may_be_passed_over():
     presence = [1.0, 0.4, 0.7, 1.0]
     chain = hmm.left_to_right([3.0, 2.0, 2.0, 4.0], presence)
@@ -192,9 +173,8 @@ def test_optional_states_may_be_passed_over():
     )
     # Without evidence, a recording of any length visits the states as often as was said.
     flat = hmm.smooth(np.zeros((400, 4)), chain)
-    visits = flat.smoothed[0] + np.array(
-        [sum(m[:, k - d].sum() for d, m in enumerate(flat.moves, 1) if k >= d) for k in range(4)]
-    )
+    visits = flat.smoothed[0] + np.array([sum(m[:, k - d].sum() for d, m in enumerate(flat.moves, 1)
+                                              if k >= d) for k in range(4)])  # fmt: skip
     np.testing.assert_allclose(visits, presence, atol=1e-9)
 
 
@@ -218,7 +198,18 @@ def test_optional_states_may_be_passed_over():
     (lambda: dense_viterbi(np.full((4, 2), -np.inf), np.zeros(2), np.zeros((2, 2))), "no state path"),
     (lambda: dense_evidence(np.array([[0, 0], [0, np.nan]]), np.zeros(2), np.zeros((2, 2))),
      r"log_likelihoods: NaN at \[1, 1\]"),
-])  # fmt: skip
+    (lambda: hmm.DurationChain([]), "expected one array a state"),
+    (lambda: hmm.DurationChain([np.zeros((2, 2))]), r"shape \(2, 2\) of state 0"),
+    (lambda: hmm.DurationChain([np.zeros(2), np.full(3, -np.inf)]), "state 1, expected numbers or -inf"),
+    (lambda: hmm.DurationChain([np.zeros(2)], [1.0, 1.0]), r"presence: shape \(2,\), expected \(1,\)"),
+    (lambda: hmm.DurationChain([np.zeros(2)], [1.5]), r"probabilities in \(0, 1\]"),
+    (lambda: hmm.DurationChain([np.zeros(2)], log_final=np.zeros(2)), r"log_final: shape \(2,\)"),
+    (lambda: hmm.lasting([3.0], [0.0]), "above 0"),
+    (lambda: hmm.StreamingFilter(hmm.lasting([3.0], [1.0]), 3), "tables of durations"),
+    (lambda: hmm.smooth([[0.0, np.nan]], hmm.lasting([3.0, 2.0], [1.0, 1.0])), "NaN"),
+    (lambda: hmm.filter(np.zeros((5, 2)), hmm.lasting([3.0, 2.0], [1.0, 1.0])), "tables of durations"),
+    (lambda: hmm.StreamingFilter(hmm.left_to_right([2.0]), -1), "lag: -1"),
+    (lambda: hmm.StreamingFilter(hmm.Chain(np.zeros((4, 2)), [0.0]), 3), "varies in time")])  # fmt: skip
 def test_refusals(make, message):
     with pytest.raises(ValueError, match=message):
         make()
@@ -236,9 +227,8 @@ def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
     for table, subtask, reason in [(starved, 1, "no sample is possible under it"),
                                    (dead_end, 2, "cannot be held to the end")]:  # fmt: skip
         with pytest.raises(hmm.InfeasibleAlignment, match=reason) as caught:
-            getattr(hmm, function)(
-                table, chain_of(bands), *{"k_best": (3,), "sample": (3,)}.get(function, ())
-            )
+            getattr(hmm, function)(table, chain_of(bands),
+                                   *{"k_best": (3,), "sample": (3,)}.get(function, ()))  # fmt: skip
         assert caught.value.subtask == subtask
 
 
@@ -265,9 +255,8 @@ def test_jit_and_vmap_over_ragged_recordings_equal_one_by_one(bits):
     for i, n in enumerate(lengths):
         alone, posterior = hmm.viterbi(ll[i, :n], chain), hmm.smooth(ll[i, :n], chain)
         assert best.starts[i].tolist() == alone.starts.tolist()
-        np.testing.assert_allclose(
-            soft.smoothed[i, :n], posterior.smoothed, atol=1e-6 if bits == 32 else 1e-12
-        )
+        np.testing.assert_allclose(soft.smoothed[i, :n], posterior.smoothed, atol=1e-6 if bits == 32
+                                   else 1e-12)  # fmt: skip
         assert (soft.smoothed[i, n:] == 0).all() and (soft.moves[0][i, n - 1 :] == 0).all()
 
 
@@ -307,7 +296,7 @@ def test_inside_jit_what_is_impossible_is_minus_infinity():
     assert np.isnan(jax.jit(hmm.log_evidence)(ll, chain))
 
 
-def test_a_process_in_single_precision_gets_the_same():
+def test_in_single_precision_a_process_gets_the_same_and_a_long_recording_its_labels():
     ll, bands = random_problem(8, 3, seed=2)
     chain = chain_of(bands)
     inside = hmm.smooth(ll, chain), hmm.viterbi(ll, chain)
@@ -315,9 +304,6 @@ def test_a_process_in_single_precision_gets_the_same():
         outside = hmm.smooth(ll, chain), hmm.viterbi(ll, chain)
     for a, b in zip(jax.tree.leaves(inside), jax.tree.leaves(outside), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_in_single_precision_a_long_recording_keeps_its_labels_inside_jit():
     rng = np.random.default_rng(3)
     n, num_states = 1_000_000, 5
     mean = 0.05 * np.arange(num_states)
@@ -332,11 +318,8 @@ def test_in_single_precision_a_long_recording_keeps_its_labels_inside_jit():
 
 def unordered(num_timesteps, num_states, seed=0):
     rng = np.random.default_rng(seed)
-    return (
-        rng.normal(size=(num_timesteps, num_states)),
-        rng.normal(size=num_states),
-        rng.normal(size=(num_states, num_states)),
-    )
+    return (rng.normal(size=(num_timesteps, num_states)), rng.normal(size=num_states),
+            rng.normal(size=(num_states, num_states)))  # fmt: skip
 
 
 def every_path(ll, initial, transition):
@@ -344,13 +327,12 @@ def every_path(ll, initial, transition):
     weights = [
         initial[p[0]] + sum(ll[t, k] for t, k in enumerate(p))
         + sum(transition[i, j] for i, j in itertools.pairwise(p))
-        for p in paths
-    ]  # fmt: skip
+        for p in paths]  # fmt: skip
     return paths, np.array(weights)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 3), (5, 2), (6, 4)])
-def test_matches_enumeration(size):
+def test_unordered_chains_match_enumeration(size):
     ll, initial, transition = unordered(*size, seed=sum(size))
     if size[1] > 2:
         transition[0, 1] = initial[2] = -np.inf
@@ -361,8 +343,15 @@ def test_matches_enumeration(size):
     np.testing.assert_allclose(dense_evidence(ll, initial, transition), np.logaddexp.reduce(weights))
 
 
-def test_states_of_almost_no_likelihood_keep_their_evidence():
-    """Where the only path leads through them, their weights do not underflow to nothing."""
+def test_a_recording_may_begin_and_end_anywhere_and_rare_states_keep_their_evidence():
+    ll, durations = lasting_problem(6, 3, seed=8)
+    durations = [np.append(table, np.zeros(6 - table.size)) for table in durations]
+    ends = {"initial": np.array([0.0, -1.0, -np.inf]), "final": np.array([-np.inf, 0.5, -2.0])}
+    starts, weights = enumerate_paths(ll, durations, np.ones(3), False, **ends)
+    chain = hmm.DurationChain(durations, log_initial=ends["initial"], log_final=ends["final"])
+    keep = np.isfinite(weights)
+    assert hmm.viterbi(ll, chain).starts.tolist() == starts[weights.argmax()].tolist()
+    np.testing.assert_allclose(hmm.log_evidence(ll, chain), np.logaddexp.reduce(weights[keep]))
     ll, initial, transition = unordered(40, 3)
     ll[:, 1] = -1e3
     initial[[0, 2]] = -np.inf
@@ -370,3 +359,212 @@ def test_states_of_almost_no_likelihood_keep_their_evidence():
     alone = initial[1] + ll[:, 1].sum() + 39 * transition[1, 1]
     np.testing.assert_allclose(dense_evidence(ll, initial, transition), alone)
     assert (dense_viterbi(ll, initial, transition).path == 1).all()
+
+
+def crossing(moves, num_states):
+    """Probability [t, k] that states up to k end between t and t + 1."""
+    out = np.zeros((len(moves[0]), num_states - 1))
+    for d, band in enumerate(moves, 1):
+        for k in range(band.shape[1]):
+            out[:, k : k + d] += band[:, k, None]
+    return out
+
+
+@pytest.mark.parametrize("num_skips", [0, 1])
+@pytest.mark.parametrize("lag", [0, 3, 20])
+def test_every_step_matches_enumeration(lag, num_skips):
+    rng = np.random.default_rng(0)
+    rows = [rng.normal(size=max(3 - d, 0)) - d for d in range(2 + num_skips)]
+    ll = rng.normal(size=(8, 3)) * 2
+    chain = hmm.Chain(rows[0], rows[1], rows[2:] or None)
+    stream = hmm.StreamingFilter(chain, lag)
+    for t, row in enumerate(ll):
+        step, bands = stream.update(row), [np.tile(r, (t, 1)) for r in rows]
+        *_, log_evidence, smoothed, moves = brute(ll[: t + 1], bands, final=np.zeros(3))
+        assert step.sample == t
+        np.testing.assert_allclose(step.log_evidence, log_evidence)
+        np.testing.assert_allclose(step.filtered, smoothed[-1], atol=1e-12)
+        assert (step.smoothed is None) == (t < lag)
+        crossed = np.vstack([np.zeros((1, 2)), crossing(moves, 3)])
+        if t >= lag:
+            np.testing.assert_allclose(step.smoothed, smoothed[t - lag], atol=1e-12)
+            np.testing.assert_allclose(step.boundary, crossed[t - lag], atol=1e-12)
+        window = stream.window()
+        assert window.first == max(t - lag, 0)
+        np.testing.assert_allclose(window.smoothed, smoothed[window.first :], atol=1e-12)
+        np.testing.assert_allclose(window.boundary, crossed[window.first :], atol=1e-12)
+    *_, smoothed, moves = brute(ll, [np.tile(r, (7, 1)) for r in rows])
+    rest = stream.finish()
+    assert rest.first == max(8 - lag, 0)
+    np.testing.assert_allclose(rest.smoothed, smoothed[rest.first :], atol=1e-12)
+    if lag:
+        crossed = np.vstack([np.zeros((1, 2)), crossing(moves, 3)])
+        np.testing.assert_allclose(rest.boundary, crossed[rest.first :], atol=1e-12)
+
+
+@pytest.mark.parametrize(("num_states", "optional"), [(1, False), (9, True)])
+def test_a_long_stream_equals_the_recording(num_states, optional):
+    rng = np.random.default_rng(num_states)
+    n, lag = 600, 40
+    ll = rng.normal(size=(n, num_states)) - 50.0  # log weights sink by 3e4
+    ll[np.arange(n), np.arange(n) * num_states // n] += 1.0
+    ll[200:220] = np.nan
+    presence = [0.9 if optional and k == 2 else 1.0 for k in range(num_states)]
+    chain = hmm.left_to_right([n / num_states] * num_states, presence)
+    stream = hmm.StreamingFilter(chain, lag)
+    steps, offline = [stream.update(row) for row in ll], hmm.filter(ll, chain)
+    np.testing.assert_allclose([s.filtered for s in steps], offline.filtered, atol=1e-9)
+    np.testing.assert_allclose(stream.finish().smoothed, hmm.smooth(ll, chain).smoothed[-lag:], atol=1e-9)
+    # Whoever waits long enough agrees with the whole recording where it is not near its end.
+    patient = hmm.StreamingFilter(chain, 300)
+    late = np.array([s.smoothed for s in (patient.update(row) for row in ll) if s.smoothed is not None])
+    np.testing.assert_allclose(late[:250], hmm.smooth(ll, chain).smoothed[:250], atol=1e-6)
+
+
+def test_memory_of_a_stream_does_not_grow():
+    stream = hmm.StreamingFilter(hmm.left_to_right([50.0, 50.0, 50.0]), 10)
+    sizes = [v.nbytes for v in vars(stream).values() if isinstance(v, np.ndarray)]
+    for row in np.random.default_rng(0).normal(size=(100, 3)):
+        stream.update(row)
+    assert [v.nbytes for v in vars(stream).values() if isinstance(v, np.ndarray)] == sizes
+    assert sum(sizes) < 2_000
+
+
+@pytest.mark.parametrize("presence", [None, [1.0, 0.5, 1.0]])
+def test_a_refused_sample_leaves_the_stream_as_it_was(presence):
+    chain = hmm.left_to_right([2.0, 2.0, 2.0], presence)
+    ll = np.random.default_rng(1).normal(size=(5, 3))
+    clean, stream = hmm.StreamingFilter(chain, 1), hmm.StreamingFilter(chain, 1)
+    with pytest.raises(ValueError, match="no sample has come"):
+        stream.window()
+    for row in ll:
+        expected = clean.update(row)
+        with pytest.raises(hmm.InfeasibleAlignment, match="no state is possible at sample"):
+            stream.update(np.full(3, -np.inf))
+        with pytest.raises(ValueError, match="missing: NaN throughout"):
+            stream.update([0.0, np.nan, 0.0])
+        with pytest.raises(ValueError, match="expected numbers"):
+            stream.update([0.0, np.inf, 0.0])
+        with pytest.raises(ValueError, match=r"shape \(2,\), expected \(3,\)"):
+            stream.update([0.0, 1.0])
+        np.testing.assert_array_equal(stream.update(row).filtered, expected.filtered)
+    early = hmm.StreamingFilter(hmm.left_to_right([2.0, 2.0, 2.0]), 1)
+    early.update([0.0, 0.0, 0.0])
+    with pytest.raises(hmm.InfeasibleAlignment, match="cannot be held to the end"):
+        early.finish()
+
+
+def enumerate_paths(ll, durations, presence, open_end, initial=None, final=None):
+    """First samples of all states and log weights of all paths, straight from the definition."""
+    num_rows, num_states = ll.shape
+    starts, weights = [], []
+    with np.errstate(divide="ignore"):
+        present, absent = np.log(presence), np.log1p(-np.array(presence))
+    for size in range(1, num_states + 1):
+        for visited in itertools.combinations(range(num_states), size):
+            for cuts in itertools.combinations(range(1, num_rows), size - 1):
+                edges = (0, *cuts, num_rows)
+                missed = [k for k in range(num_states) if k not in visited]
+                before = [k for k in missed if k < visited[0]]
+                after = [k for k in missed if k > visited[-1]]
+                weight = absent[[k for k in missed if k not in before and k not in after]].sum()
+                weight += present[list(visited[1:])].sum()
+                first = absent[before].sum() + present[visited[0]] if initial is None else initial[visited[0]]
+                weight += first + (absent[after].sum() if final is None else final[visited[-1]])
+                for k, (a, b) in zip(visited, itertools.pairwise(edges), strict=True):
+                    table = np.append(durations[k], np.full(num_rows + 1, -np.inf))
+                    cut = open_end and b == num_rows
+                    lasts = np.logaddexp.reduce(table[b - a - 1 :]) if cut else table[b - a - 1]
+                    weight += lasts + ll[a:b, k].sum()
+                if weight == -np.inf:
+                    continue
+                row = np.full(num_states, num_rows)
+                for k, a in zip(visited, edges[:-1], strict=True):
+                    row[k] = a
+                starts.append(np.minimum.accumulate(row[::-1])[::-1])
+                weights.append(weight)
+    return np.array(starts), np.array(weights)
+
+
+def lasting_problem(num_rows, num_states, seed):
+    rng = np.random.default_rng(seed)
+    durations = [rng.normal(size=rng.integers(1, num_rows + 1)) - 1 for _ in range(num_states)]
+    durations[0][0] = -np.inf if durations[0].size > 1 else 0.0  # some durations are impossible
+    # One length of tables a size, so that one program does all.
+    durations[-1] = np.append(durations[-1], np.full(num_rows - durations[-1].size, -5.0))
+    return 2 * rng.normal(size=(num_rows, num_states)), durations
+
+
+@pytest.mark.parametrize("open_end", [False, True])
+@pytest.mark.parametrize("optional", [False, True])
+@pytest.mark.parametrize("size", [(1, 1), (6, 2), (8, 3), (7, 4)])
+def test_every_quantity_matches_enumeration_of_durations(size, optional, open_end):
+    for seed in range(20):  # the first random tables that allow any path
+        ll, durations = lasting_problem(*size, seed=sum(size) + 100 * seed)
+        presence = np.array([1.0, 0.6, 0.3, 0.8][: size[1]]) if optional else np.ones(size[1])
+        ll[size[0] // 2] = np.nan if size[0] > 2 else 0.0  # a missing sample
+        x = np.nan_to_num(ll)
+        starts, weights = enumerate_paths(x, durations, presence, open_end)
+        if len(weights):
+            break
+    chain = hmm.DurationChain(durations, presence, open_end=open_end)
+    log_evidence = np.logaddexp.reduce(weights)
+    p, lengths = np.exp(weights - log_evidence), np.diff(starts, axis=1, append=len(ll))
+    states = np.array([np.repeat(np.arange(size[1]), row) for row in lengths])
+    np.testing.assert_allclose(hmm.log_evidence(ll, chain), log_evidence, rtol=1e-12)
+    best = hmm.viterbi(ll, chain)
+    assert best.starts.tolist() == starts[weights.argmax()].tolist()
+    np.testing.assert_allclose(best.log_prob, weights.max(), rtol=1e-12)
+    ranked, order = hmm.k_best(ll, chain, 9), np.argsort(-weights)[:9]
+    np.testing.assert_allclose(ranked.log_prob, weights[order], rtol=1e-11)
+    assert ranked.starts.tolist() == starts[order].tolist()
+    posterior = hmm.smooth(ll, chain)
+    np.testing.assert_allclose(posterior.log_evidence, log_evidence, rtol=1e-12)
+    smoothed = np.array([[p[states[:, t] == k].sum() for k in range(size[1])] for t in range(len(ll))])
+    np.testing.assert_allclose(posterior.smoothed, smoothed, atol=1e-12)
+    for d, moves in enumerate(posterior.moves, 1):
+        expected = [[p[(states[:, t] == k) & (states[:, t + 1] == k + d)].sum() for k in range(size[1] - d)]
+                    for t in range(len(ll) - 1)]  # fmt: skip
+        np.testing.assert_allclose(moves, np.reshape(expected, moves.shape), atol=1e-12)
+
+
+def test_draws_have_the_exact_path_probabilities_of_durations():
+    ll, durations = lasting_problem(6, 3, seed=3)
+    durations = [np.append(table, np.zeros(6 - table.size)) for table in durations]
+    presence = np.array([0.7, 0.5, 0.8])
+    starts, weights = enumerate_paths(ll, durations, presence, False)
+    drawn = hmm.sample(ll, hmm.DurationChain(durations, presence), 20_000, seed=5).starts
+    p = np.exp(weights - np.logaddexp.reduce(weights))
+    counts = np.array([(drawn == row).all(axis=1).sum() for row in starts])
+    assert counts.sum() == len(drawn)
+    often = p * len(drawn) > 5
+    observed = np.append(counts[often], counts[~often].sum())
+    expected = np.append(p[often], p[~often].sum()) * len(drawn)
+    assert chisquare(observed[expected > 0], expected[expected > 0]).pvalue > 1e-3
+
+
+def test_tables_of_lasting_have_their_moments_and_decide_where_samples_do_not():
+    chain = hmm.lasting([30.0, 10.0], [2.0, 2.0])
+    found = hmm.viterbi([np.zeros((40, 2)), np.zeros((37, 2))], chain)
+    assert found.num_samples.tolist() == [40, 37]
+    assert abs(found.starts[0, 1] - 30) <= 1 and abs(found.starts[1, 1] - 28.5) <= 1.5
+    interval = hmm.smooth(np.zeros((40, 2)), chain).start_intervals(0.9)[0]
+    np.testing.assert_allclose(interval, [30 - 2.3, 30 + 2.3], atol=1.0)  # sd 2 / sqrt(2)
+    chain = hmm.lasting([50.0, 200.0], [10.0, 5.0])
+    n, p = np.arange(1, chain.pmf.shape[1] + 1), np.exp(chain.pmf)
+    np.testing.assert_allclose(p.sum(axis=1), 1.0)
+    np.testing.assert_allclose(p @ n, [50.0, 200.0], rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(p @ n**2 - (p @ n) ** 2), [10.0, 5.0], rtol=1e-2)
+
+
+def test_no_path_names_the_state():
+    chain = hmm.DurationChain([np.zeros(3), np.zeros(3)])
+    with pytest.raises(hmm.InfeasibleAlignment) as caught:
+        hmm.viterbi(np.zeros((9, 2)), chain)  # six samples at most
+    assert caught.value.subtask == 1
+    bad = np.zeros((4, 2))
+    bad[0, 0] = -np.inf
+    for ask in (hmm.viterbi, hmm.smooth, hmm.log_evidence):
+        with pytest.raises(hmm.InfeasibleAlignment) as caught:
+            ask(bad, chain)
+        assert caught.value.subtask == 0

@@ -27,9 +27,7 @@ PRIOR = (2.5e-4, 0.75e-4)
 
 
 def squeeze(step=0.02, compliance=2.5e-4):
-    """A grip that closes and then holds."""
-    rng = np.random.default_rng(0)
-    fine = np.arange(0, 0.8, 1e-4)
+    rng, fine = np.random.default_rng(0), np.arange(0, 0.8, 1e-4)
     force = 4 * np.clip(fine / 0.15, 0, 1) ** 1.5 + 0.3 * np.sin(9 * fine) * (fine > 0.15)
     t = np.arange(0.02, 0.78, step)
     load = np.interp(t, fine, force) + 0.012 * rng.standard_normal(t.size)
@@ -38,12 +36,13 @@ def squeeze(step=0.02, compliance=2.5e-4):
     return Stretch(t, load, step, clock, place, 2e-5)
 
 
-def test_the_slope_of_a_squeeze_is_the_compliance():
+def test_slopes_and_toes_of_squeezes_are_found_where_there_are_any():
     load, value = reading(squeeze())
     slope, information = fit_slope(load, value, 2e-5)
-    assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5)
-    assert np.std(value + slope * load) < 4e-5
+    assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5) and np.std(value + slope * load) < 4e-5
     assert fit_slope(load[:3], value[:3], 2e-5) == fit_slope(0 * load, value, 2e-5) == (0.0, 0.0)
+    assert find_toe(releases(Toe(-4e-4, 0.8))) is NONE
+    assert find_toe([]) is NONE and find_toe([(np.ones(3), np.ones(3), SD)]) is NONE
 
 
 def test_loads_that_ring_while_nothing_moves_say_little_of_the_pads():
@@ -69,10 +68,12 @@ def test_releases_of_grips_that_ring_are_not_early():
     assert np.abs(ends - judged.boundaries)[3::4].max() < 0.02  # 26 and 37 ms with pads taken to be rigid
 
 
-def test_holds_in_which_misread_forces_pull_say_nothing_of_a_delay():
+def test_soft_pads_and_holds_in_which_misread_forces_pull_are_no_delay():
     t = np.arange(0.0, 0.8, 0.02)
     pulls = Squeeze(t, np.full(t.size, 0.02), np.zeros(t.size), -1.0 - 0.1 * t, 2e-5, 0.01)
     assert lateness([pulls], PRIOR) == lateness([], PRIOR) == Lateness()
+    own = [whole_grip(seed=i, compliance=1.6 * COMPLIANCE) for i in range(4)]
+    assert not lateness(own, PRIOR).late
 
 
 @pytest.mark.parametrize("shift", [-0.003, 0.003])
@@ -91,34 +92,25 @@ def world(**effects):
     return found, np.array([s.start for s in found.spans[1:]]) - judged.boundaries
 
 
-def test_recorded_lag_is_found_and_said():
+def test_recorded_lag_is_found_and_said_and_healthy_forces_are_on_time():
     found, residual = world(force_lag={"delay": 0.12})
     assert "come late" in found.remarks[0] or "filtered" in found.remarks[0]
     assert np.median(np.abs(residual)) < 0.012
-
-
-def test_healthy_forces_are_neither_late_nor_filtered():
     found, residual = world()
-    assert found.remarks == ()
-    assert np.median(np.abs(residual)) < 0.004
+    assert found.remarks == () and np.median(np.abs(residual)) < 0.004
 
 
-def test_reading_again_undoes_what_was_found():
+def test_reading_again_undoes_what_was_found_and_smears_no_jump():
     t = np.arange(0, 1, 0.01)
-    ramp = np.clip(t - 0.3, 0, 0.4)
-    zero = np.zeros(t.size)
+    ramp, zero = np.clip(t - 0.3, 0, 0.4), np.zeros(t.size)
     late = np.interp(t - 0.05, t, ramp)
-    known = dict.fromkeys(
-        ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2"), late
-    )
+    known = dict.fromkeys(("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2"),
+                          late)  # fmt: skip
     signals = Signals(t, **known, sd_x=zero, sd_y=zero, sd_vx=zero, sd_vy=zero, sd_force=0.01)
     pad = Compliance(2.5e-4, 1e-6, 0.05)
     again = read_again(signals, Sensing(pad, pad, 0.05, 0.001, late=True))
     np.testing.assert_allclose(again.fx1[:94], ramp[:94], atol=1e-12)
     np.testing.assert_allclose(again.x1, late)
-
-
-def test_a_jump_is_not_smeared_over_the_samples_before_it():
     t = np.arange(20) * 0.05
     jump = np.where(t < 0.5, 0.0, 1.0)
     for late in (0.01, 0.02, 0.03, 0.04):
@@ -138,8 +130,7 @@ def test_friction_is_the_steepest_ratio_that_a_contact_shows_for_sure():
                       **dict.fromkeys(still, np.zeros_like(t)))  # fmt: skip
     parameters = Parameters(np.zeros(4), {"a": 1.0}, {"force": 0.01})
     one, two = steepest(signals, 0.0, 0.8, parameters)
-    assert one == pytest.approx(0.8, abs=0.06) and one < 0.8
-    assert two == pytest.approx(0.4, abs=0.06)
+    assert one == pytest.approx(0.8, abs=0.06) and one < 0.8 and two == pytest.approx(0.4, abs=0.06)
     assert steepest(signals, 0.9, 1.0, parameters) == []
 
 
@@ -147,9 +138,7 @@ COMPLIANCE, WIDTH = 2.5e-4, 0.03
 
 
 def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE):
-    """Fingers that close on a block, hold it and open, their forces late by `delay` or filtered."""
-    rng = np.random.default_rng(seed)
-    fine = np.arange(0, 2.0, 1e-4)
+    rng, fine = np.random.default_rng(seed), np.arange(0, 2.0, 1e-4)
     start = rng.uniform(0.3, 0.32)
     closed = np.clip((fine - start) / 0.25, 0, 1) - np.clip((fine - start - 0.9) / 0.25, 0, 1)
     way = closed**2 * (3 - 2 * closed)
@@ -169,20 +158,13 @@ def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE
 @pytest.mark.parametrize("delay", [0.03, 0.06, 0.2])
 def test_a_delay_is_found(delay, step):
     found = lateness([whole_grip(delay, step=step, seed=i) for i in range(4)], PRIOR)
-    assert found.late and not found.filter
-    assert found.delay == pytest.approx(delay, abs=0.006)
+    assert found.late and not found.filter and found.delay == pytest.approx(delay, abs=0.006)
 
 
 @pytest.mark.parametrize("constant", [0.03, 0.06])
 def test_a_filter_is_found_and_told_from_a_delay(constant):
     found = lateness([whole_grip(constant=constant, seed=i) for i in range(4)], PRIOR)
-    assert found.late and found.filter
-    assert found.delay == pytest.approx(constant, rel=0.2)
-
-
-def test_pads_softer_than_stated_are_no_delay():
-    own = [whole_grip(seed=i, compliance=1.6 * COMPLIANCE) for i in range(4)]
-    assert not lateness(own, PRIOR).late
+    assert found.late and found.filter and found.delay == pytest.approx(constant, rel=0.2)
 
 
 @pytest.mark.parametrize("prior", [PRIOR, (0.0, 2e-4)])
@@ -198,7 +180,6 @@ def test_a_small_delay_is_found_and_is_no_sensor_s(delay):
 
 
 def half_a_grip(step, noise, sd_load, seed):
-    """Fingers that close on a block, or open if the seed is odd; no velocities."""
     rng, fine = np.random.default_rng(seed), np.arange(0, 1.0, 1e-4)
     way = np.clip((fine - 0.2) / 0.35, 0, 1)
     distance = (WIDTH + 0.01 - 0.0105 * way**3 * (10 - 15 * way + 6 * way**2))[:: (-1) ** seed]
@@ -219,13 +200,11 @@ def test_noise_that_joining_and_filters_average_tells_of_no_delay(step, noise, s
 def test_unfiltering_undoes_a_filter_and_shows_no_touch_before_it_is_made():
     fine = np.arange(0, 1.0, 1e-4)
     force = 4 * np.clip((fine - 0.31) / 0.2, 0, 1)
-    kept = np.exp(-1e-4 / 0.03)
-    t = np.arange(0, 0.98, 0.02)
+    kept, t = np.exp(-1e-4 / 0.03), np.arange(0, 0.98, 0.02)
     filtered = np.interp(t, fine, lfilter([1 - kept], [1, -kept], force))
     undone, louder = _unfiltered(t, filtered, 0.03)
     np.testing.assert_allclose(undone, np.interp(t, fine, force), atol=0.15)
-    assert louder == pytest.approx(np.sqrt(5))
-    assert np.abs(undone[t < 0.31]).max() < 0.02
+    assert louder == pytest.approx(np.sqrt(5)) and np.abs(undone[t < 0.31]).max() < 0.02
 
 
 @pytest.mark.parametrize("step", [0.05, 0.01, 0.002])
@@ -247,9 +226,7 @@ SD = 2e-5
 
 
 def releases(toe=NONE, number=8, compliances=(1e-4,), seed=0):
-    """Loads from 10 N to none of grips that let go, and the fingers' distance."""
-    rng = np.random.default_rng(seed)
-    out = []
+    rng, out = np.random.default_rng(seed), []
     for k in range(number):
         load = np.r_[np.full(8, 10.0), np.linspace(10, rng.uniform(0.1, 0.6), 9)]
         give = compliances[k % len(compliances)] * load + toe.give(load)
@@ -259,8 +236,7 @@ def releases(toe=NONE, number=8, compliances=(1e-4,), seed=0):
 
 @pytest.mark.parametrize("planted", [Toe(6e-4, 0.8), Toe(3e-4, 1.6)])
 def test_a_planted_toe_is_found(planted):
-    found = find_toe(releases(planted))
-    at = np.array([0.0, 0.2, 1.0, 4.0])
+    found, at = find_toe(releases(planted)), np.array([0.0, 0.2, 1.0, 4.0])
     np.testing.assert_allclose(found.give(at), planted.give(at), atol=6e-5)
     assert found.slope == pytest.approx(planted.slope, rel=0.3)
 
@@ -268,8 +244,3 @@ def test_a_planted_toe_is_found(planted):
 @pytest.mark.parametrize("compliances", [(1e-4,), (1e-4, 2e-4)])
 def test_straight_contacts_have_none_however_they_differ(compliances):
     assert all(find_toe(releases(compliances=compliances, seed=seed)) is NONE for seed in range(10))
-
-
-def test_contacts_that_stiffen_the_other_way_and_too_few_samples_have_none():
-    assert find_toe(releases(Toe(-4e-4, 0.8))) is NONE
-    assert find_toe([]) is NONE and find_toe([(np.ones(3), np.ones(3), SD)]) is NONE

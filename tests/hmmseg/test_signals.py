@@ -29,11 +29,7 @@ FLATTENS = 0.03  # s in which a block that landed on its corner comes to lie fla
 
 
 def rolling_trial(number: int, angle: float, world: str = "50 Hz") -> tuple[Trial, Rig, np.ndarray]:
-    """A simulated trial with hand and block rolled by up to `angle` [rad] in carries, rig, boundaries [s].
-
-    The roll grows from lift to landing. The hand is higher by what the corner hangs lower, so that the
-    landing is when it was. Its roll stands in the column `hand_roll`, which may be left out.
-    """
+    """A trial whose hand and block roll by up to `angle` [rad] from lift to landing, rig, boundaries [s]."""
     (judged,) = trials_of(WORLDS[world], [number])
     s, b = task_space(judged.trial, judged.rig), judged.boundaries
     roll = np.zeros(s.t.size)
@@ -57,29 +53,25 @@ def rolling_trial(number: int, angle: float, world: str = "50 Hz") -> tuple[Tria
             mean = mean + (a == "y") * {"": higher, "v": np.gradient(higher, s.t), "f": 0.0}[kind]
             c[f"{kind}{a}1"], c[f"{kind}{a}2"] = mean - new / 2, mean + new / 2
     sd_x, sd_y, sd_v = (float(np.median(v)) * np.sqrt(2) for v in (s.sd_x, s.sd_y, s.sd_vx))
-    noise = Noise(
-        position=float(np.hypot(sd_x, sd_y) / np.sqrt(2)), velocity=sd_v, force=judged.rig.noise.force
-    )
+    noise = Noise(position=float(np.hypot(sd_x, sd_y) / np.sqrt(2)), velocity=sd_v,
+                  force=judged.rig.noise.force)  # fmt: skip
     rig = Rig(rate=judged.rig.rate, gravity=judged.rig.gravity, fingertip=judged.rig.fingertip, noise=noise)
     return replace(judged.trial, channels=c | {ROLL: roll}), rig, b
 
 
-FINGERS = {
-    "1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
-    "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]},
-}
+FINGERS = {"1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
+           "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]}}  # fmt: skip
 JOINTED = parse_rig({"fingers": FINGERS, "noise": {"angle": 2e-4, "velocity": 0.03, "force": 0.012}})
 CARTESIAN = parse_rig({"noise": {"position": 1e-4, "velocity": 0.01, "force": 0.02}})
 
 
 def cartesian(samples=12) -> pd.DataFrame:
     values = np.random.default_rng(0).normal(scale=0.1, size=(samples, len(CARTESIAN_CHANNELS)))
-    return pd.DataFrame(
-        {"t": np.arange(samples) * 0.05} | dict(zip(CARTESIAN_CHANNELS, values.T, strict=True))
-    )
+    return pd.DataFrame({"t": np.arange(samples) * 0.05} | dict(zip(CARTESIAN_CHANNELS, values.T,
+                                                                    strict=True)))  # fmt: skip
 
 
-def test_noise_of_a_position_agrees_with_samples():
+def test_noise_of_positions_and_of_derived_velocities_agrees_with_samples():
     rng, n = np.random.default_rng(1), 20_000
     frame = pd.DataFrame({"t": np.arange(n) * 1e-3, **{name: 0.0 for name in JOINT_CHANNELS}})
     for name, angle in (("q11", -2.0), ("q12", -0.1), ("q21", -1.1), ("q22", -3.0)):
@@ -91,6 +83,14 @@ def test_noise_of_a_position_agrees_with_samples():
         rms = np.sqrt(both.var(axis=1).mean())  # `sd_*` is the fingers' root mean square
         assert getattr(signals, f"sd_{axis}").mean() == pytest.approx(rms, rel=0.03)
     assert signals.sd_force == 0.012
+    rng, n = np.random.default_rng(2), 20_000
+    frame = pd.DataFrame({"t": np.arange(n) * 0.01,
+                          **{name: 0.0 for name in CARTESIAN_CHANNELS if "v" not in name}})  # fmt: skip
+    for name in ("x1", "y1", "x2", "y2"):
+        frame[name] = rng.normal(scale=1e-4, size=n)
+    signals = task_space(read_trial(frame, CARTESIAN), CARTESIAN)
+    assert signals.sd_vx[5] == pytest.approx(signals.vx1.std(), rel=0.03)
+    assert signals.sd_vy[0] == pytest.approx(2 * signals.sd_vy[5])
 
 
 def test_cartesian_velocities_given_or_derived():
@@ -101,35 +101,20 @@ def test_cartesian_velocities_given_or_derived():
     t = frame["t"].to_numpy()
     frame["x1"], frame["x2"] = t**2 / 100, t**2 / 100 + 0.1
     frame.loc[7, "x1"] = np.nan
-    derived = task_space(
-        read_trial(frame.drop(columns=["vx1", "vy2"]).assign(vx2=np.nan), CARTESIAN), CARTESIAN
-    )
+    derived = task_space(read_trial(frame.drop(columns=["vx1", "vy2"]).assign(vx2=np.nan), CARTESIAN),
+                         CARTESIAN)  # fmt: skip
     assert np.isnan(derived.vx1[7])
     np.testing.assert_allclose(np.delete(derived.vx1, 7)[1:-1], np.delete(t, 7)[1:-1] / 50, atol=1e-12)
     np.testing.assert_allclose(derived.vx2[1:-1], t[1:-1] / 50, atol=1e-12)
     np.testing.assert_array_equal(derived.vy1, frame["vy1"])
 
 
-def test_noise_of_a_derived_velocity_agrees_with_samples():
-    rng, n = np.random.default_rng(2), 20_000
-    frame = pd.DataFrame(
-        {"t": np.arange(n) * 0.01, **{name: 0.0 for name in CARTESIAN_CHANNELS if "v" not in name}}
-    )
-    for name in ("x1", "y1", "x2", "y2"):
-        frame[name] = rng.normal(scale=1e-4, size=n)
-    signals = task_space(read_trial(frame, CARTESIAN), CARTESIAN)
-    assert signals.sd_vx[5] == pytest.approx(signals.vx1.std(), rel=0.03)
-    assert signals.sd_vy[0] == pytest.approx(2 * signals.sd_vy[5])
-
-
 def test_task_space_of_a_grip():
     frame = cartesian()
     frame = frame.assign(fx1=2.0, fx2=-1.5, fy1=0.3, fy2=0.1, x1=0.1, x2=0.13, y1=0.02, y2=0.05)
     signals = task_space(read_trial(frame, CARTESIAN), CARTESIAN)
-    found = {
-        name: getattr(signals, name)[0]
-        for name in ("grip", "fx", "fy", "shear", "distance", "offset", "x", "y")
-    }
+    found = {name: getattr(signals, name)[0]
+             for name in ("grip", "fx", "fy", "shear", "distance", "offset", "x", "y")}  # fmt: skip
     assert found == pytest.approx({"grip": 1.5, "fx": 0.5, "fy": 0.4, "shear": 0.1, "distance": 0.03,
                                    "offset": 0.03, "x": 0.115, "y": 0.035})  # fmt: skip
 
@@ -145,12 +130,15 @@ def test_inverse_undoes_forward(number):
     np.testing.assert_allclose(forward(HAND[number], q), TIPS, atol=1e-14)
 
 
-def test_angles_of_a_known_pose():
+def test_angles_of_a_known_pose_and_a_tip_out_of_reach():
     # Both links at right angles: link 1 straight down, link 2 level, as drawn by hand.
     q = inverse(HAND[1], 1, np.array([0.05 + 0.10, 0.17 - 0.12]))
     np.testing.assert_allclose(q, [-np.pi / 2, 0.0], atol=1e-12)
     q = inverse(HAND[2], 2, np.array([0.21 - 0.12, 0.17 - 0.12]))
     np.testing.assert_allclose(q, [-np.pi / 2, -np.pi], atol=1e-12)
+    with pytest.raises(InputError, match=r"finger 1: the task needs a tip 0\.5\d+ m from its base"):
+        require_reach(HAND[1], 1, np.array([[0.6, 0.17]]))
+    require_reach(HAND[1], 1, TIPS)
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -165,12 +153,6 @@ def test_velocities_agree_with_differences_and_with_jax(number):
     np.testing.assert_allclose(by_jax, speed, atol=1e-13)
 
 
-def test_a_tip_out_of_reach_is_refused():
-    with pytest.raises(InputError, match=r"finger 1: the task needs a tip 0\.5\d+ m from its base"):
-        require_reach(HAND[1], 1, np.array([[0.6, 0.17]]))
-    require_reach(HAND[1], 1, TIPS)
-
-
 def _trial() -> tuple[Trial, Rig]:
     folder = example_folder()
     rig = Rig.read(folder / "rig.toml")
@@ -180,8 +162,7 @@ def _trial() -> tuple[Trial, Rig]:
 def _with_differences(trial: Trial, over: int) -> Trial:
     channels = dict(trial.channels)
     for name in ("q11", "q12", "q21", "q22"):
-        q = channels[name]
-        first = np.zeros(over)
+        q, first = channels[name], np.zeros(over)
         channels[f"d{name}"] = np.concatenate(
             [first, (q[over:] - q[:-over]) / (trial.t[over:] - trial.t[:-over])]
         )
@@ -200,20 +181,16 @@ def test_velocities_that_repeat_the_positions_are_replaced_by_central_difference
     assert error[0] < 0.6 * error[1]
 
 
-def test_velocities_of_their_own_stay():
+def test_velocities_of_their_own_stay_and_rates_beside_a_kink_are_of_their_own_side():
     trial, rig = _trial()
     signals = task_space(trial, rig)
     assert timely(signals, trial) is signals
     still = np.zeros(50)  # positions that never change prove nothing
     assert not late_differences(np.arange(50) * 0.05, still, still)
-
-
-def test_rates_beside_a_kink_are_those_of_their_own_side():
     t = np.arange(40) * 0.05
     kink = t[20]
     left, right = one_sided(t, np.where(t < kink, 0.3 * t + 0.1 * t**2, 0.3 * kink + 0.1 * kink**2))[0]
-    assert left[20] == pytest.approx(0.3 + 0.2 * kink, rel=1e-6)
-    assert right[20] == pytest.approx(0.0, abs=1e-9)
+    assert left[20] == pytest.approx(0.3 + 0.2 * kink, rel=1e-6) and right[20] == pytest.approx(0.0, abs=1e-9)
     t, rng = np.arange(20_000) * 0.05, np.random.default_rng(1)
     rates, noise = one_sided(t, rng.standard_normal(t.size))
     assert rates[:, 5:-5].std() == pytest.approx(noise, rel=0.03)
@@ -228,12 +205,19 @@ def made_signals(t, rng, sd=0.1):
     return Signals(t=t, **columns, **spread, sd_force=sd)
 
 
-def test_noise_is_found_beneath_a_smooth_signal():
+def test_noise_is_found_beneath_a_smooth_signal_and_of_means_and_distances():
     rng, t = np.random.default_rng(0), np.arange(2000) * 0.05
     noise = noise_sd(np.sin(t) + 0.01 * rng.normal(size=t.size))
     assert noise == pytest.approx(0.01, rel=0.1)
     stepped = np.sin(t) + 0.01 * rng.normal(size=t.size) + 5.0 * (t > 40) + 5.0 * (t > 70)
     assert noise_sd(stepped) == pytest.approx(0.01, rel=0.1)
+    rig = Rig(noise=Noise(position=3e-5, velocity=4e-3, force=0.01), fingertip=Fingertip())
+    t = np.arange(40) * 0.05
+    trial = Trial("made.csv", t, {name: np.sin(t) for name in CHANNELS})
+    f = features(task_space(trial, rig), rig)
+    np.testing.assert_allclose(f.sd_y, 3e-5 / np.sqrt(2))
+    np.testing.assert_allclose(f.sd_d, 3e-5 * np.sqrt(2))
+    np.testing.assert_allclose(f.sd_vx, 4e-3 / np.sqrt(2))
 
 
 def test_thinning_averages_groups_and_their_noise():
@@ -251,7 +235,7 @@ def test_thinning_averages_groups_and_their_noise():
     assert read.sd_force == pytest.approx(0.1 / np.sqrt(6))
 
 
-def test_thinning_skips_missing_values():
+def test_means_over_time_skip_missing_values():
     t = np.arange(8) / 80
     signals = made_signals(t, np.random.default_rng(2))
     signals.fy1[[0, 2, 3]] = np.nan
@@ -259,9 +243,6 @@ def test_thinning_skips_missing_values():
     np.testing.assert_allclose(thinned.fy1[0], signals.fy1[1])
     assert np.isnan(thinned.fy1[1])
     np.testing.assert_allclose(thinned.fy1[2:], signals.fy1[4:].reshape(2, 2).mean(axis=1))
-
-
-def test_acceleration_skips_missing_samples():
     t = np.array([0.0, 0.1, 0.25, 0.3, 0.5, 0.6])
     velocity = 3 * t**2 + 1
     np.testing.assert_allclose(acceleration(t, velocity)[1:-1], 6 * t[1:-1], rtol=1e-12)
@@ -270,17 +251,6 @@ def test_acceleration_skips_missing_samples():
     assert np.isnan(found[2])
     np.testing.assert_allclose(found[[1, 3, 4]], 6 * t[[1, 3, 4]], rtol=1e-12)
     assert np.isnan(acceleration(t[:2], velocity[:2])).all()
-
-
-def test_noise_of_means_and_distances():
-    """Mean and distance of two fingers with independent noise s: s / sqrt(2) and s sqrt(2)."""
-    rig = Rig(noise=Noise(position=3e-5, velocity=4e-3, force=0.01), fingertip=Fingertip())
-    t = np.arange(40) * 0.05
-    trial = Trial("made.csv", t, {name: np.sin(t) for name in CHANNELS})
-    f = features(task_space(trial, rig), rig)
-    np.testing.assert_allclose(f.sd_y, 3e-5 / np.sqrt(2))
-    np.testing.assert_allclose(f.sd_d, 3e-5 * np.sqrt(2))
-    np.testing.assert_allclose(f.sd_vx, 4e-3 / np.sqrt(2))
 
 
 @pytest.mark.parametrize("deriv", [0, 1, 2])
@@ -292,7 +262,7 @@ def test_local_parabolas_are_those_of_savitzky_and_golay(size, window, deriv):
     np.testing.assert_allclose(smooth(t, values, deriv, window), expected, atol=1e-12 * 100.0**deriv)
 
 
-def test_what_lags_behind_a_filter_is_what_the_filter_makes_of_every_step():
+def test_filters_and_distances_between_samples_are_those_of_every_step():
     rng = np.random.default_rng(1)
     values, kept = rng.normal(size=(2, 3, 50)), np.array([0.0, 0.3, 0.95])
     place, share = np.array([0, 0, 7, 20, 48]), rng.uniform(size=5)
@@ -300,9 +270,6 @@ def test_what_lags_behind_a_filter_is_what_the_filter_makes_of_every_step():
         every = lfilter([1 - k], [1, -k], values, zi=k * values[..., :1])[0]
         expected = (1 - share) * every[..., place] + share * every[..., place + 1]
         np.testing.assert_allclose(lagging(values, kept, place, share)[..., c], expected, rtol=1e-14)
-
-
-def test_distances_between_samples_are_hermite_pieces():
     rng = np.random.default_rng(2)
     t = np.cumsum(rng.uniform(0.01, 0.05, size=20))
     distance, rate = rng.normal(size=(2, 20))
@@ -311,11 +278,22 @@ def test_distances_between_samples_are_hermite_pieces():
     np.testing.assert_allclose(found, CubicHermiteSpline(t, distance, rate)(clock), atol=1e-12)
 
 
-def test_a_twentieth_of_wild_samples_hardly_moves_a_deviation():
+def test_robust_numbers_hardly_move_with_wild_samples_weights_and_gaps():
     residual = np.random.default_rng(0).normal(0.0, 2.0, 100_000)
     assert robust_sd(residual) == pytest.approx(2.0, rel=0.01)
     residual[::20] = 1e6
     assert robust_sd(residual) == pytest.approx(2.0, rel=0.08)
+    rng = np.random.default_rng(2)
+    values, times = rng.normal(size=31), rng.integers(1, 9, 31)
+    times[0] += 1 - times.sum() % 2  # an odd number of values has one in the middle
+    assert weighted_median(values, times.astype(float)) == np.median(np.repeat(values, times))
+    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0  # of what is there
+    values = np.array([0.0, np.nan, np.nan, 9.0])
+    np.testing.assert_allclose(bridged(values), [0, 3, 6, 9])
+    np.testing.assert_allclose(bridged(values, np.array([0.0, 1.0, 8.0, 9.0])), [0, 1, 8, 9])
+    assert bridged(np.ones(3)).tolist() == [1.0, 1.0, 1.0]
+    with pytest.raises(ValueError, match="empty"):
+        bridged(np.full(3, np.nan))
 
 
 @pytest.mark.parametrize("order", [1, 2, 4])
@@ -325,31 +303,11 @@ def test_white_noise_is_seen_on_a_bending_signal(order):
     assert white_sd(signal, order) == pytest.approx(0.1, rel=0.02)
 
 
-def test_a_weighted_median_is_that_of_repeated_values():
-    rng = np.random.default_rng(2)
-    values, times = rng.normal(size=31), rng.integers(1, 9, 31)
-    times[0] += 1 - times.sum() % 2  # an odd number of values has one in the middle
-    assert weighted_median(values, times.astype(float)) == np.median(np.repeat(values, times))
-    assert weighted_median(np.array([np.nan, 1.0, 9.0]), np.array([9.0, 1.0, 3.0])) == 9.0  # of what is there
-
-
-def test_gaps_are_bridged_in_time():
-    values = np.array([0.0, np.nan, np.nan, 9.0])
-    np.testing.assert_allclose(bridged(values), [0, 3, 6, 9])
-    np.testing.assert_allclose(bridged(values, np.array([0.0, 1.0, 8.0, 9.0])), [0, 1, 8, 9])
-    assert bridged(np.ones(3)).tolist() == [1.0, 1.0, 1.0]
-    with pytest.raises(ValueError, match="empty"):
-        bridged(np.full(3, np.nan))
-
-
-def test_equations_of_a_rolled_block():
+def test_a_recorded_roll_is_taken_out_by_the_equations_of_a_rolled_block():
     corners = np.array([[-0.03, 0.0], [0.03, 0.0]])
     x, y = turned(*corners.T, 0.02)
     assert y[1] - y[0] == pytest.approx(rolled_offset(0.06, 0.02), rel=1e-4)
     assert np.hypot(x, y) == pytest.approx([0.03, 0.03])
-
-
-def test_a_recorded_roll_is_taken_out():
     rolled, _, _ = rolling_trial(76200, 0.05)
     level, _, _ = rolling_trial(76200, 0.0)
     found = remove_roll(rolled)

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from estimation.identification import identify_aligned
 from experiments.wrist import ARM_RIG
 from experiments.wrist_scene import BLOCKS, Setup, performances, wrist_recording, wrist_rig
 from experiments.wrist_scene import TASK as RESTACK
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, subtasks
-from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.formats import read_table
@@ -35,11 +35,11 @@ CASE = RECORDINGS / "paper_blocks"
 TASK, RIG = CASE / "task.toml", CASE / "rig.toml"
 NONE = RECORDINGS / "none_1"
 TRUTH = json.loads((CASE / "truth" / "trial_01.json").read_text())["boundaries"]
+SETUP = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))  # untared
 
 
 def read(file=CASE / "trial_01.csv", rig=RIG):
-    trial = Trial.read(file, rig)
-    watcher = Watcher(file.parent / "task.toml", rig)
+    trial, watcher = Trial.read(file, rig), Watcher(file.parent / "task.toml", rig)
     table = np.stack([trial.channels[name] for name in watcher.channels], axis=1)
     return watcher, trial.t, table
 
@@ -56,14 +56,12 @@ def watched():
 
 
 def test_emissions_are_those_off_line():
-    """A hypothesis that knows the parameters to the end scores as the emissions off line do."""
     rig, task = Rig.read(RIG), Task.read(TASK)
     trial = Trial.read(CASE / "trial_01.csv", rig)
     f = features(task_space(trial, rig), rig)
     scale = {"force": 0.012, "carry": 0.02, "net_x": 0.05, "shear": 0.08, "velocity": 0.003, "level": 1e-4,
              "width": 1e-4}  # fmt: skip
-    steps = subtasks(task)
-    bias = np.array([0.01, -0.02, 0.005, 0.0])
+    steps, bias = subtasks(task), np.array([0.01, -0.02, 0.005, 0.0])
     p = Parameters(bias, {"block1": 0.34, "block2": 0.44}, scale, {"block1": 0.016, "block2": 0.0254},
                    ({1: 0.05},))  # fmt: skip
     expected, halting = log_likelihoods(f, steps, p, 0, rung=0.0), _log_halting(f, p)
@@ -101,21 +99,15 @@ def test_emissions_are_those_off_line():
             np.testing.assert_allclose(found, expected[n, step.index], rtol=1e-6, atol=1e-6)
 
 
-def test_one_answer_a_row_and_a_last_one(watched):
+def test_answers_of_a_watched_task_agree_with_those_off_line_and_tighten(watched):
     _, lines, final = watched
     assert len(lines) == 200
     wanted = {"t", "subtask", "object", "state", "probabilities", "next", "properties", "fits"}
     for line in lines:
-        assert wanted <= set(line)
-        assert len(line["probabilities"]) == 9
-        assert sum(line["probabilities"]) + line["departed"] == pytest.approx(1, abs=1e-5)
-        assert line["fits"]
+        assert wanted <= set(line) and len(line["probabilities"]) == 9
+        assert sum(line["probabilities"]) + line["departed"] == pytest.approx(1, abs=1e-5) and line["fits"]
     assert lines[0]["subtask"] == "pregrasp" and lines[0]["next"]["subtask"] == "pickup"
-    assert lines[-1]["next"] is None
-    assert final["final"] is True and final["fits"]
-
-
-def test_boundaries_and_properties_agree_with_those_off_line(watched):
+    assert lines[-1]["next"] is None and final["final"] is True and final["fits"]
     watcher, _, final = watched
     trial = Trial.read(CASE / "trial_01.csv", RIG)
     off_line = segment([trial], Task.read(TASK), Rig.read(RIG))[0].spans
@@ -127,58 +119,17 @@ def test_boundaries_and_properties_agree_with_those_off_line(watched):
     assert blocks["block1"]["weight"]["mean"] == pytest.approx(0.343, abs=0.02)
     assert blocks["block2"]["width"]["mean"] == pytest.approx(0.0254, abs=2e-4)
     assert blocks["block1"]["height"]["mean"] == pytest.approx(0.016, abs=2e-4)
-
-
-def test_uncertainties_tighten(watched):
     _, lines, _ = watched
     sds = [line["properties"]["block1"]["weight"]["sd"] for line in lines
            if "weight" in line["properties"].get("block1", {}) and 2.5 < line["t"] < 3.7]  # fmt: skip
     assert sds[-1] < 0.7 * sds[0]
 
 
-def test_nothing_is_looked_ahead(watched):
-    """What comes later changes no answer before."""
+def test_nothing_is_looked_ahead_and_late_and_repeated_rows_lose_nothing(watched):
     _, lines, _ = watched
     watcher, t, table = read()
     table[120:] = table[:80]
     assert follow(watcher, t[:120], table[:120]) == lines[:120]
-
-
-def test_a_smaller_lag_settles_sooner_from_less():
-    settled = {}
-    for lag in (0.1, 1.0):
-        _, t, table = read()
-        watcher = Watcher(TASK, RIG, lag)
-        for at_, row in zip(t, table, strict=True):
-            watcher.update(at_, row)
-            if watcher.crossings:
-                settled[lag] = at_
-                break
-    assert settled[0.1] < settled[1.0] <= TRUTH[0] + 1.0 + 0.15
-
-
-def test_a_block_let_go_in_mid_air_is_noticed():
-    _, t, table = read()
-    cut = int(np.searchsorted(t, 3.0))
-    rest = int(np.searchsorted(t, 4.6))  # what free motion looks like
-    table = np.vstack([table[:cut], table[rest : rest + 30]])
-    lines = follow(Watcher(TASK, RIG), t[: len(table)], table)
-    assert all(line["fits"] for line in lines[:cut])
-    assert not lines[-1]["fits"]
-    assert lines[-1]["failed"]["subtask"] == "place"
-
-
-def test_a_recording_that_ends_early_does_not_fit(watched):
-    watcher, t, table = read()
-    for at_, row in zip(t[:100], table[:100], strict=True):
-        answer = watcher.update(at_, row)
-    assert answer.fits
-    final = json.loads(watcher.finish().line())
-    assert not final["fits"] and final["failed"]["index"] == 5
-
-
-def test_late_and_repeated_rows_lose_nothing(watched):
-    """Rows in another order, some twice, give the same last answer."""
     straight, _, final = watched
     watcher, t, table = read()
     order = [*range(50), 52, 51, 50, 50, *range(53, 120), 122, 120, 121, *range(123, 200)]
@@ -193,8 +144,40 @@ def test_late_and_repeated_rows_lose_nothing(watched):
     assert_alike(found["properties"], final["properties"])
 
 
+def test_what_cannot_be_watched_is_refused_and_a_smaller_lag_settles_sooner():
+    settled = {}
+    for lag in (0.1, 1.0):
+        _, t, table = read()
+        watcher = Watcher(TASK, RIG, lag)
+        for at_, row in zip(t, table, strict=True):
+            watcher.update(at_, row)
+            if watcher.crossings:
+                settled[lag] = at_
+                break
+    assert settled[0.1] < settled[1.0] <= TRUTH[0] + 1.0 + 0.15
+    refused("plain ordered task", Watcher, {"sequence": ["a", "b"]}, RIG)
+    refused("lag", Watcher, TASK, RIG, -1.0)
+    with pytest.raises(ValueError, match="expected"):
+        Watcher(TASK, RIG).update(0.0, [1.0])
+
+
+def test_a_block_let_go_in_mid_air_and_an_early_end_do_not_fit(watched):
+    _, t, table = read()
+    cut = int(np.searchsorted(t, 3.0))
+    rest = int(np.searchsorted(t, 4.6))  # what free motion looks like
+    table = np.vstack([table[:cut], table[rest : rest + 30]])
+    lines = follow(Watcher(TASK, RIG), t[: len(table)], table)
+    assert all(line["fits"] for line in lines[:cut]) and not lines[-1]["fits"]
+    assert lines[-1]["failed"]["subtask"] == "place"
+    watcher, t, table = read()
+    for at_, row in zip(t[:100], table[:100], strict=True):
+        answer = watcher.update(at_, row)
+    assert answer.fits
+    final = json.loads(watcher.finish().line())
+    assert not final["fits"] and final["failed"]["index"] == 5
+
+
 def assert_alike(one, other):
-    """The same document, but for the last digit that is written."""
     if isinstance(one, dict):
         assert one.keys() == other.keys()
         for key in one:
@@ -205,15 +188,12 @@ def assert_alike(one, other):
         assert one == pytest.approx(other, rel=1e-5)
 
 
-def test_gaps_and_rows_beyond_the_lag_are_told():
+def test_gaps_rows_beyond_the_lag_and_missing_channels_are_told_and_pass():
     watcher, t, table = read()
     keep = (t < 1.0) | (t > 1.3)
     lines = follow(watcher, t[keep], table[keep])
     assert [line["note"] for line in lines if "note" in line] == ["gap: 0.4 s since the row before"]
     assert "too late" in watcher.update(0.5, table[10] + 1e-3).note
-
-
-def test_missing_channels_and_rows_of_nothing_pass():
     watcher, t, table = read()
     table[10:14, 3] = np.nan
     table[60:63] = np.nan
@@ -231,8 +211,7 @@ def test_a_missing_force_is_taken_to_be_the_other_fingers(name, measure):
 
 @pytest.mark.parametrize("names", [("fx1", "fy1"), ("fx1", "fy1", "fx2", "fy2")])
 def test_a_block_is_not_dropped_where_forces_are_not_read(names):
-    """The other finger presses as hard, or both as before: a distance without the pads' give would be that of
-    another block."""
+    """A distance without the pads' give would be that of another block."""
     watcher, t, table = read(NONE / "trial_01.csv", NONE / "rig.toml")
     lifted, landed = json.loads((NONE / "truth" / "trial_01.json").read_text())["boundaries"][1:3]
     gone = (t > lifted + 0.3) & (t < lifted + 0.8 * (landed - lifted))
@@ -242,27 +221,23 @@ def test_a_block_is_not_dropped_where_forces_are_not_read(names):
     assert all(line["fits"] for line in lines)
 
 
-def test_memory_and_hypotheses_do_not_grow():
+def test_hypotheses_do_not_grow_with_time_and_a_clock_that_leaps_leaves_few():
     watcher, t, table = read()
     sizes = []
     for again in range(5):  # ever further free motion after the end
         for at_, row in zip(t[:30], table[:30], strict=True):
             watcher.update(again * 2.0 + at_, row)
         sizes.append((len(watcher.filter.rows), watcher.filter._state.count))
-    assert len({rows for rows, _ in sizes[1:]}) == 1
-    assert max(count for _, count in sizes) < 100
+    assert len({rows for rows, _ in sizes[1:]}) == 1 and max(count for _, count in sizes) < 100
+    watcher, t, table = read()
+    for at, row in zip([*t[:60], 3.9e7, 3.9e7 + 0.05, *t[60:80], 1e12], table[:83], strict=True):
+        watcher.update(float(at), row)
+        state = watcher.filter._state
+        mine = {(h["state"], h["entered"][0]) for h in state.rows[: state.count]}
+        assert len(mine) == state.count
 
 
-def test_what_cannot_be_watched_is_refused():
-    with pytest.raises(InputError, match="plain ordered task"):
-        Watcher({"sequence": ["a", "b"]}, RIG)
-    with pytest.raises(InputError, match="lag"):
-        Watcher(TASK, RIG, -1.0)
-    with pytest.raises(ValueError, match="expected"):
-        Watcher(TASK, RIG).update(0.0, [1.0])
-
-
-def test_two_hypotheses_merge_to_the_moments_of_their_mixture():
+def test_two_hypotheses_merge_to_the_moments_of_their_mixture_and_keep_a_common_time():
     rng = np.random.default_rng(0)
     share, mean, sd = np.array([0.3, 0.7]), np.array([1.0, 1.6]), np.array([0.05, 0.1])
     rows = np.zeros(2, HYPOTHESIS)
@@ -278,27 +253,11 @@ def test_two_hypotheses_merge_to_the_moments_of_their_mixture():
     for each in moments:
         assert each[0, 0] == pytest.approx(drawn.mean(), abs=2e-3)
         assert each[0, 1] == pytest.approx(drawn.var(), rel=0.01)
-
-
-def test_hypotheses_that_entered_at_the_same_time_still_do_once_merged_however_late_it_is():
-    """Rounded apart they would never merge again and fill their table: a clock that leaps ended in a hang."""
     for share in np.linspace(0.05, 0.95, 19):
         rows = np.zeros(2, HYPOTHESIS)
         rows["weight"], rows["entered"][:, 0] = np.log([share, 1 - share]), 1.7e12 / 3
         absorb(Table(rows, np.ones((2, 8, 2))), 0, Table(rows.copy(), np.ones((2, 8, 2))), 1)
         assert rows["entered"][0, 0] == rows["entered"][1, 0]
-
-
-def test_a_clock_that_leaps_leaves_few_hypotheses():
-    watcher, t, table = read()
-    for at, row in zip([*t[:60], 3.9e7, 3.9e7 + 0.05, *t[60:80], 1e12], table[:83], strict=True):
-        watcher.update(float(at), row)
-        state = watcher.filter._state
-        mine = {(h["state"], h["entered"][0]) for h in state.rows[: state.count]}
-        assert len(mine) == state.count
-
-
-SETUP = Setup(rate=20.0, reaction=True, offset=(3.0, -2.0, 8.0))  # untared
 
 
 @pytest.fixture(scope="module")
@@ -308,12 +267,10 @@ def performed():
 
 
 def follow_wrist(columns, rig, task=RESTACK, stop=None):
-    watcher = Watcher(task, rig)
-    lines = []
+    watcher, lines = Watcher(task, rig), []
     for k, t in enumerate(columns["t"][:stop]):
-        lines.append(
-            json.loads(watcher.update(float(t), {n: columns[n][k] for n in watcher.channels}).line())
-        )
+        lines.append(json.loads(watcher.update(float(t), {n: columns[n][k]
+                                                          for n in watcher.channels}).line()))  # fmt: skip
     return watcher, lines, json.loads(watcher.finish().line())
 
 
@@ -328,8 +285,7 @@ def test_the_last_answer_agrees_with_that_off_line(performed, watched_wrist):
     rig = wrist_rig(SETUP)
     aligned = align([read_trial(columns, rig)], RESTACK, rig)
     spans, identified = aligned.segmentations[0].spans, identify_aligned(aligned)
-    assert final["fits"]
-    assert [c.step.name for c in watcher.crossings] == [s.subtask for s in spans[1:]]
+    assert final["fits"] and [c.step.name for c in watcher.crossings] == [s.subtask for s in spans[1:]]
     for crossing, span, true in zip(watcher.crossings, spans[1:], simulated.boundaries, strict=True):
         assert abs(crossing.t - span.start) < 3 * np.hypot(crossing.sd, span.start_sd)
         assert abs(crossing.t - true) < 3 * crossing.sd
@@ -361,8 +317,7 @@ def test_nothing_is_known_before_the_first_grip_and_nothing_is_looked_ahead(perf
     assert again == lines[:cut]
 
 
-def test_a_gripper_that_only_pauses_has_gripped_nothing(performed):
-    """A preshape before the grip looks like one; what was thought since is taken back."""
+def test_pauses_on_the_way_to_a_grip_are_taken_back(performed):
     _, columns = performed
     early = columns | {"gap": columns["gap"].copy()}
     t, gap = early["t"], early["gap"]
@@ -371,10 +326,6 @@ def test_a_gripper_that_only_pauses_has_gripped_nothing(performed):
     watcher, _, final = follow_wrist(early, wrist_rig(SETUP))
     assert final["fits"], final["failed"]
     assert watcher.crossings[0].t > 1.9
-
-
-def test_every_pause_on_the_way_to_a_grip_is_taken_back(performed):
-    """However soon the next pause, or the grip, follows the one that is refuted."""
     simulated, columns = performed
     slow = columns | {"gap": columns["gap"].copy()}
     t, gap = slow["t"], slow["gap"]
@@ -386,24 +337,19 @@ def test_every_pause_on_the_way_to_a_grip_is_taken_back(performed):
     assert watcher.crossings[4].t == pytest.approx(simulated.boundaries[4], abs=0.05)
 
 
-def test_a_drifting_sensor_is_told_as_an_uncertain_weight(performed):
+def test_drifting_sensors_and_a_first_grip_without_free_motion_are_told(performed):
     simulated, _ = performed
     setup = Setup(rate=20.0, drift=0.02)
     _, _, final = follow_wrist(wrist_recording(simulated, setup, 1), wrist_rig(setup))
     for obj, block in BLOCKS.items():
         found = final["properties"][obj]["weight"]
         assert abs(found["mean"] - block.weight) < 3 * found["sd"]
-
-
-def test_a_first_grip_without_free_motion_is_told(performed):
     _, columns = performed
     late = {name: c[columns["t"] > 1.7] for name, c in columns.items()}
-    with pytest.raises(InputError, match="no free motion"):
-        follow_wrist(late, wrist_rig(SETUP))
+    refused("no free motion", follow_wrist, late, wrist_rig(SETUP))
 
 
 def test_an_opening_is_read_as_it_comes():
-    """Closes at 0.1 m/s on something 30 mm wide that gives 1 mm, and opens again."""
     t = np.arange(0, 3, 0.01)
     way = 0.05 - 0.1 * np.clip(t - 0.5, 0, None)
     held = 0.029 + 0.001 * np.exp(-(t - 0.7) / 0.03)
@@ -425,8 +371,7 @@ def test_a_grip_lasts_until_its_pads_let_go(give):
     """However far they have yielded: a gripper has turned long before."""
     t = np.arange(0, 3, 0.01)
     way = np.maximum(0.036 - 0.1 * np.clip(t - 0.5, 0, None), 0.03 - give)
-    opening = way + 0.1 * np.clip(t - 2, 0, None)
-    closings = Opening(3000.0)
+    opening, closings = way + 0.1 * np.clip(t - 2, 0, None), Opening(3000.0)
     for at, value in zip(t, opening, strict=True):
         closings.follow(float(at), float(value))
     (grip,) = closings.grips
@@ -438,8 +383,7 @@ def test_a_load_that_vanishes_is_told_within_half_a_second(shared):
     """As when a block drops out of the grip in mid-air; what is smoothed errs alike, but not so much."""
     folder = shared / "panda" / "wrist_restack_1"
     raw = trial_of(read_table(folder / "wrist_01.csv", None), ARM_RIG, None)
-    columns = {"t": raw.t} | raw.channels
-    gone = (raw.t > 4.36) & (raw.t < 5.78)
+    columns, gone = {"t": raw.t} | raw.channels, (raw.t > 4.36) & (raw.t < 5.78)
     columns["Fz"] = columns["Fz"] + 0.466 * gone
     _, lines, final = follow_wrist(columns, ARM_RIG, read_task(folder / "task.toml"))
     assert not final["fits"]
@@ -457,10 +401,8 @@ def test_the_command_follows_a_wrist(performed, monkeypatch, capsys, tmp_path):
         '[gripper]\nposition = ["px", "py", "pz"]\nopening = "gap"\nwrench = ["Fx", "Fy", "Fz"]\n'
         "[fingertip]\nnormal_stiffness = 4000.0\nshear_stiffness = 2500.0\n"
     )
-    rows = [
-        ",".join(columns),
-        *(",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True)),
-    ]
+    rows = [",".join(columns),
+            *(",".join(f"{v:.9g}" for v in row) for row in zip(*columns.values(), strict=True))]  # fmt: skip
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO("\n".join(rows).encode() + b"\n")))
     code = main(["watch", "--task", str(tmp_path / "task.toml"), "--rig", str(tmp_path / "rig.toml")])
     out, err = capsys.readouterr()

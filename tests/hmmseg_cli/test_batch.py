@@ -14,8 +14,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from refusals import refused
 
-from hmmseg.errors import InputError
 from hmmseg.example import example_folder
 from hmmseg_cli import batch
 from hmmseg_cli.batch import recordings_in, segment_apart
@@ -40,7 +40,6 @@ def made(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def one(made):
-    """What one worker finds."""
     return segmented(made, "--workers", "1")
 
 
@@ -59,11 +58,18 @@ def segmented(lab, *arguments, trials="many"):
     return json.loads((lab / "out.json").read_text())
 
 
-def test_digits_do_not_depend_on_who_works(lab, one):
+def test_digits_depend_neither_on_who_works_nor_on_the_order_of_a_set_of_names(lab, one):
     assert segmented(lab, "--workers", "2") == one
     assert [Path(t["file"]).as_posix() for t in one["trials"]] == [f"many/{i}.csv" for i in range(6)]
     alone = segmented(lab, trials="many/5.csv")["trials"]  # as without workers
     assert alone == one["trials"][5:]
+    found = set()
+    for seed in ("0", "1"):
+        command = [sys.executable, "-m", "hmmseg_cli.main", "segment", "many/0.csv", "--task", "task.toml",
+                   "--rig", "rig.toml", "--json", "-", "--quiet"]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONHASHSEED": seed})
+        found.add(done.stdout)
+    assert len(found) == 1
 
 
 def test_a_cluster_finds_the_same(lab, one):
@@ -71,13 +77,21 @@ def test_a_cluster_finds_the_same(lab, one):
     assert segmented(lab, "--scheduler", "local", "--workers", "2") == one
 
 
-def test_what_is_wrong_with_one_recording_is_one_line(lab, capfd, tmp_path):
+def test_bad_recordings_folders_and_plain_sequences_are_told_in_a_line(lab, capfd, tmp_path):
     (tmp_path / "bad.csv").write_text("t,x1\n0,1\n")
     arguments = ["--task", "task.toml", "--rig", "rig.toml", "--json", f"{tmp_path}/out.json"]
     assert main(["segment", "many/0.csv", f"{tmp_path}/bad.csv", *arguments, "--workers", "2"]) == 2
-    assert "bad.csv: " in (said := capfd.readouterr().err)
-    assert said.count("\n") == 1
+    assert "bad.csv: " in (said := capfd.readouterr().err) and said.count("\n") == 1
     assert not (tmp_path / "out.json").exists()
+    (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')
+    assert main(["segment", "many", "--task", "order.toml", "--workers", "2"]) == 2
+    assert "go with tasks of blocks alone" in capfd.readouterr().err
+    ((pile := tmp_path / "pile") / "inner").mkdir(parents=True)
+    for name in ("b.csv", "a.CSV", "rig.toml", "c.npz"):
+        (pile / name).touch()
+    found = recordings_in([pile / "b.csv", pile])
+    assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
+    refused("no recordings in this folder", recordings_in, [pile / "inner"])
 
 
 @pytest.mark.parametrize(("more", "said"), [
@@ -94,33 +108,6 @@ def test_refusals(lab, more, said, capfd, monkeypatch):
         pytest.importorskip("dask.distributed", reason="dask is not installed (extra cluster)")
     assert main(["segment", "many", "--task", "task.toml", "--rig", "rig.toml", *more]) == 2
     assert said in capfd.readouterr().err
-
-
-def test_plain_sequences_are_pooled(lab, capfd):
-    (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')
-    assert main(["segment", "many", "--task", "order.toml", "--workers", "2"]) == 2
-    assert "go with tasks of blocks alone" in capfd.readouterr().err
-
-
-def test_a_folder_stands_for_its_recordings(tmp_path):
-    for name in ("b.csv", "a.CSV", "rig.toml", "c.npz"):
-        (tmp_path / name).touch()
-    (tmp_path / "inner").mkdir()
-    found = recordings_in([tmp_path / "b.csv", tmp_path])
-    assert [p.name for p in found] == ["b.csv", "a.CSV", "b.csv", "c.npz"]
-    with pytest.raises(InputError, match="no recordings in this folder"):
-        recordings_in([tmp_path / "inner"])
-
-
-def test_the_order_of_a_set_of_names_moves_no_digit(lab):
-    """Python's hashes of names differ from process to process, and with them the order of sets."""
-    found = set()
-    for seed in ("0", "1"):
-        command = [sys.executable, "-m", "hmmseg_cli.main", "segment", "many/0.csv", "--task", "task.toml",
-                   "--rig", "rig.toml", "--json", "-", "--quiet"]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONHASHSEED": seed})
-        found.add(done.stdout)
-    assert len(found) == 1
 
 
 class Deadly(Executor):

@@ -17,6 +17,8 @@ from hmmseg_cli.main import main
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 NONE = RECORDINGS / "none_1"
 RIG_AND_TASK = ("--task", str(NONE / "task.toml"), "--rig", str(NONE / "rig.toml"))
+SINGLE = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
+PAPER = (example_folder() / "task.toml").read_text(encoding="utf-8")
 
 
 def document(*args: str, out: Path) -> dict:
@@ -32,10 +34,9 @@ def document(*args: str, out: Path) -> dict:
 def identified(tmp_path_factory) -> tuple[dict, Path]:
     folder = tmp_path_factory.mktemp("identified")
     trials = [str(NONE / f"trial_0{i}.csv") for i in (1, 2)]
-    found = document(
-        "identify", *trials, *RIG_AND_TASK, "--actual", str(NONE / "actual.toml"), "--figures",
-        str(folder / "figures"), "--report", str(folder / "page.html"), out=folder / "out.json",
-    )  # fmt: skip
+    found = document("identify", *trials, *RIG_AND_TASK, "--actual", str(NONE / "actual.toml"), "--figures",
+                     str(folder / "figures"), "--report", str(folder / "page.html"),
+                     out=folder / "out.json")  # fmt: skip
     return found, folder
 
 
@@ -50,9 +51,8 @@ def test_segment_finds_every_boundary(tmp_path):
     assert [s["end"] for s in segments[:-1]] == pytest.approx(truth, abs=0.03)
     assert [a["end"] for a in segments[:-1]] == [b["start"] for b in segments[1:]]
     assert segments[0]["start"] == 0.0 and segments[-1]["end"] == pytest.approx(9.95)
-    assert [s["subtask"] for s in segments] == [
-        "pregrasp", "pickup", "carry", "place", "release", "pickup", "carry", "place", "release",
-    ]  # fmt: skip
+    assert [s["subtask"] for s in segments] == ["pregrasp", "pickup", "carry", "place", "release", "pickup",
+                                                "carry", "place", "release"]  # fmt: skip
     for segment in segments[1:]:
         low, high = segment["start_90"]
         assert low < segment["start"] < high and segment["start_sd"] > 0
@@ -90,10 +90,7 @@ def test_identify_draws_figures_and_one_self_contained_page(identified):
     assert 'src="http' not in page and 'href="http' not in page
 
 
-SINGLE = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
-
-
-def test_what_the_task_cannot_tell_is_null_with_the_reason(tmp_path):
+def test_what_a_task_cannot_tell_or_does_not_name_is_said(tmp_path):
     task, folder = tmp_path / "task.toml", tmp_path / "made"
     task.write_text(SINGLE)
     rig = str(NONE / "rig.toml")
@@ -101,22 +98,28 @@ def test_what_the_task_cannot_tell_is_null_with_the_reason(tmp_path):
     trial = str(folder / "trial_01.csv")
     found = document("identify", trial, "--task", str(task), "--rig", rig, out=tmp_path / "o.json")
     assert found["trials"][0]["complete"] and found["warnings"] == []
-    assert found["properties"]["block1"]["height"] is None
-    assert found["reasons"]["block1.height"]
+    assert found["properties"]["block1"]["height"] is None and found["reasons"]["block1.height"]
     assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.343, rel=0.03)
+    task, trial = tmp_path / "task.toml", tmp_path / "trial.csv"
+    task.write_text(SINGLE)  # but the recorded block comes down from another, 12.5 mm
+    cut = pd.read_csv(NONE / "trial_01.csv")
+    cut[cut.t < 5.5].to_csv(trial, index=False)
+    found = document("identify", str(trial), "--task", str(task), "--rig", str(NONE / "rig.toml"),
+                     out=tmp_path / "o.json")  # fmt: skip
+    assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.57789, rel=0.03)
+    (warning,) = found["warnings"]
+    assert warning.startswith("block1 was lowered by 12.5 mm")
 
 
 def test_sums_stand_where_their_terms_do_not(tmp_path):
-    """Three blocks restacked show only sums of heights; a block that only slides shows no weight."""
     true = {"a": (0.4, 0.04, 0.03), "b": (0.9, 0.05, 0.025), "c": (1.4, 0.06, 0.04)}
     units = {"weight": "N", "width": "m", "height": "m"}
     entries = ((o, *entry) for o, own in true.items() for entry in zip(units.items(), own, strict=True))
     actual, tower, pushed = tmp_path / "actual.toml", tmp_path / "tower.toml", tmp_path / "pushed.toml"
     actual.write_text("".join(f'[{o}.{p}]\nunit = "{unit}"\nvalue = {v}\n' for o, (p, unit), v in entries))
     stands = "".join(f'[objects.{o}]\non = "{on}"\n' for o, on in (("a", "b"), ("b", "c"), ("c", "ground")))
-    moves = [
-        f'[[moves]]\nobject = "{o}"\nto = "{to}"\n' for o, to in (("a", "ground"), ("b", "a"), ("c", "b"))
-    ]
+    moves = [f'[[moves]]\nobject = "{o}"\nto = "{to}"\n'
+             for o, to in (("a", "ground"), ("b", "a"), ("c", "b"))]  # fmt: skip
     tower.write_text(stands + "".join(moves))
     pushed.write_text(stands + moves[0] + '[[moves]]\nobject = "b"\nto = "c"\nslide = true\n')
     found = {}
@@ -125,9 +128,8 @@ def test_sums_stand_where_their_terms_do_not(tmp_path):
         made = tmp_path / task.stem
         simulate = ["simulate", *args, "--properties", str(actual), "--output", str(made), "--quiet"]
         assert main(simulate) == 0
-        found[task.stem] = document(
-            "identify", str(made / "trial_01.csv"), *args, out=tmp_path / f"{task.stem}.json"
-        )
+        found[task.stem] = document("identify", str(made / "trial_01.csv"), *args,
+                                    out=tmp_path / f"{task.stem}.json")  # fmt: skip
     sums = {tuple(one["of"]): one for one in found["tower"]["combinations"]}
     assert sums.keys() == {("b.height", "c.height"), ("a.height", "b.height")}
     for names, one in sums.items():
@@ -141,29 +143,12 @@ def test_sums_stand_where_their_terms_do_not(tmp_path):
     assert found["pushed"]["reasons"]["b.weight"] == "no subtask of this task lifts b"
 
 
-def test_an_object_that_the_task_does_not_name_is_said(tmp_path):
-    task, trial = tmp_path / "task.toml", tmp_path / "trial.csv"
-    task.write_text(SINGLE)  # but the recorded block comes down from another, 12.5 mm
-    cut = pd.read_csv(NONE / "trial_01.csv")
-    cut[cut.t < 5.5].to_csv(trial, index=False)
-    found = document(
-        "identify", str(trial), "--task", str(task), "--rig", str(NONE / "rig.toml"), out=tmp_path / "o.json"
-    )
-    assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.57789, rel=0.03)
-    (warning,) = found["warnings"]
-    assert warning.startswith("block1 was lowered by 12.5 mm")
-
-
-def test_the_papers_method_has_no_evidence_and_its_own_formulas(tmp_path):
+def test_rigs_without_stiffness_and_the_papers_method_say_what_they_lack(tmp_path):
     trial = str(NONE / "trial_02.csv")
     found = document("identify", trial, *RIG_AND_TASK, "--method", "paper", out=tmp_path / "out.json")
     assert found["method"] == "paper" and found["trials"][0]["log_evidence"] is None
     assert found["properties"]["block1"]["width"]["mean"] < 0.0185  # short by what the pads give
-
-
-def test_a_rig_that_states_no_stiffness_is_not_said_to_state_rigid_pads(tmp_path):
-    rig = tmp_path / "rig.toml"
-    text = (NONE / "rig.toml").read_text()
+    rig, text = tmp_path / "rig.toml", (NONE / "rig.toml").read_text()
     rig.write_text(re.sub(r"(?m)^(normal|shear)_stiffness.*$", "", text))
     args = (str(NONE / "trial_01.csv"), "--task", str(NONE / "task.toml"), "--rig", str(rig))
     warnings = "; ".join(document("identify", *args, out=tmp_path / "out.json")["warnings"])
@@ -224,13 +209,9 @@ def test_plain_ordered_task_fits_saves_and_segments(tmp_path):
         assert math.isfinite(trial["log_evidence"])
 
 
-PAPER = (example_folder() / "task.toml").read_text(encoding="utf-8")
-
-
 @pytest.fixture
 def decomposed(tmp_path, capsys, monkeypatch):
     """Run the command on a task's text; returns its document and what people see."""
-
     monkeypatch.setenv("COLUMNS", "120")
 
     def run(text: str) -> tuple[dict, str]:
@@ -243,7 +224,7 @@ def decomposed(tmp_path, capsys, monkeypatch):
     return run
 
 
-def test_equation_1_of_the_paper(decomposed):
+def test_the_papers_equation_1_and_its_document(decomposed):
     document, printed = decomposed(PAPER)
     assert document["equation"].split(",\n      ") == [
         "T = { Pregrasp 1 = (free-motion, {∅})",
@@ -261,15 +242,10 @@ def test_equation_1_of_the_paper(decomposed):
     (row,) = (line for line in printed.splitlines() if "│ carry block1" in line)
     cells = [cell.strip() for cell in row.split("│")]
     assert cells[3:7] == ["hold-above-ground", "vertical", "horizontal", ""]
-
-
-def test_document_of_the_paper(decomposed):
     document, _ = decomposed(PAPER)
     assert document["minimal"] == list(range(9))
-    assert document["height_equations"] == [
-        {"move": 1, "rise": {"block2": -1}},
-        {"move": 2, "rise": {"block1": 1}},
-    ]
+    assert document["height_equations"] == [{"move": 1, "rise": {"block2": -1}},
+                                            {"move": 2, "rise": {"block1": 1}}]  # fmt: skip
     assert (document["reasons"], document["notes"], document["repeat"]) == ({}, [], 1)
     pickup = document["subtasks"][1]
     assert {key: pickup[key] for key in ("index", "subtask", "object", "state", "move", "support")} == {
@@ -286,7 +262,7 @@ def test_document_of_the_paper(decomposed):
                                        "given": [], "condition": None}]}  # fmt: skip
 
 
-def test_names_reasons_and_notes(decomposed):
+def test_names_reasons_and_notes_of_blocks_and_of_a_plain_sequence(decomposed):
     document, printed = decomposed(
         'repeat = "unknown"\n[objects.cup]\non = "ground"\n[objects.lid]\non = "ground"\n'
         '[[moves]]\nobject = "cup"\nto = "ground"\nslide = true\n'
@@ -297,15 +273,10 @@ def test_names_reasons_and_notes(decomposed):
     assert document["properties"]["lid"]["weight"] is None
     assert document["reasons"]["lid.weight"] == "no recorded move grips lid"
     assert document["properties"]["cup"]["friction_on_ground"]["kind"] == "value"
-    assert document["repeat"] == "unknown"
-    assert "one round is decomposed" in printed
+    assert document["repeat"] == "unknown" and "one round is decomposed" in printed
     assert "lid.weight: no recorded move grips lid" in printed
-
-
-def test_plain_ordered_task(decomposed):
     document, printed = decomposed('sequence = ["approach", "mating"]')
     assert document["equation"] == "T = { approach = (approach, {∅}),\n      mating = (mating, {∅}) }"
     assert document["properties"] == {}
     assert document["notes"] == ["a plain ordered task has no block physics: no properties"]
-    assert "height_equations" not in document
-    assert "approach" in printed
+    assert "height_equations" not in document and "approach" in printed

@@ -8,24 +8,11 @@ import sys
 import tomllib
 from pathlib import Path
 
+import file_writers
 import numpy as np
 import pandas as pd
 import pytest
 from fault_scene import CARTESIAN
-from file_writers import (
-    bag_of,
-    finger_columns,
-    finger_topics,
-    finger_vectors,
-    german,
-    lerobot_of,
-    mcap_of,
-    robomimic_of,
-    wrist_topics,
-    wrist_vectors,
-    write_mcap,
-    write_robomimic,
-)
 
 from experiments.wrist_scene import Setup, performances, wrist_recording
 from hmmseg.hand.inspect import inspect, propose
@@ -41,33 +28,61 @@ NONE = Path(__file__).resolve().parents[2] / "recordings/none_1"
 T = np.arange(0, 2, 0.02)
 WRIST = {"t": T, "width": 0.06 - 0.03 * (T > 1), "ee_y": 0.1 * T, "ee_z": 0.2 - 0.05 * T,
          **{f"{letter}{axis}": np.sin(T) for letter in "FT" for axis in "xyz"}}  # fmt: skip
-OTHERS = {
-    "t": ("stamp", 1e9), "x1": ("finger_left_x_mm", 1e3), "y1": ("finger_left_z_mm", 1e3),
-    "vx1": ("finger_left_vx", 1.0), "vy1": ("finger_left_vz", 1.0), "fx1": ("LeftForceX [mN]", 1e3),
-    "fy1": ("LeftForceZ [mN]", 1e3), "x2": ("finger_right_x", 1e3), "y2": ("finger_right_z", 1e3),
-    "vx2": ("finger_right_vx", 1.0), "vy2": ("finger_right_vz", 1.0), "fx2": ("RightForceX [mN]", -1e3),
-    "fy2": ("RightForceZ [mN]", -1e3),
-}  # fmt: skip
+OTHERS = {"t": ("stamp", 1e9), "x1": ("finger_left_x_mm", 1e3), "y1": ("finger_left_z_mm", 1e3),
+          "vx1": ("finger_left_vx", 1.0), "vy1": ("finger_left_vz", 1.0), "fx1": ("LeftForceX [mN]", 1e3),
+          "fy1": ("LeftForceZ [mN]", 1e3), "x2": ("finger_right_x", 1e3), "y2": ("finger_right_z", 1e3),
+          "vx2": ("finger_right_vx", 1.0), "vy2": ("finger_right_vz", 1.0), "fx2": ("RightForceX [mN]", -1e3),
+          "fy2": ("RightForceZ [mN]", -1e3)}  # fmt: skip
+FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
+RATE = 20
+SIDES = {"1": "links", "2": "rechts"}
+FINGER_NAMES = {name: (f"Finger_{SIDES[name[1]]}_{name[0]}_mm", 1e3) if len(name) == 2
+                else (f"Kraft_{SIDES[name[2]]}_{name[1]}_N", 1.0) for name in FINGERS
+                if name != "t"}  # fmt: skip
+WRIST_NAMES = {"width": ("Oeffnung_mm", 1e3), "ee_y": ("TCP_y_mm", 1e3), "ee_z": ("TCP_z_mm", 1e3),
+               **{f"F{axis}": (f"F{axis}_N", 1.0) for axis in "xyz"}}  # fmt: skip
+FINGER_FILES = {
+    "MCAP": lambda f: file_writers.mcap_of(f / "a.mcap", file_writers.finger_topics(FINGERS)),
+    "ROS 1 bag": lambda f: file_writers.bag_of(f / "a.bag", file_writers.finger_topics(FINGERS)),
+    "ROS 2 bag": lambda f: file_writers.bag_of(f / "a", file_writers.finger_topics(FINGERS)),
+    "LeRobot v2": lambda f: lerobot(f / "a", 2, RATE, file_writers.finger_columns(FINGERS)),
+    "LeRobot v3": lambda f: lerobot(f / "a", 3, RATE, file_writers.finger_columns(FINGERS)),
+    "robomimic": lambda f: (
+        f"{file_writers.robomimic_of(f / 'a.hdf5', RATE, [file_writers.finger_vectors(FINGERS)] * 2)}#demo_1"
+    ),
+    "CSV of a spreadsheet": lambda f: written(f / "a.csv", file_writers.german(FINGERS, FINGER_NAMES)),
+}
+WRIST_FILES = {
+    "MCAP": lambda f, c: file_writers.mcap_of(f / "a.mcap", file_writers.wrist_topics(c)),
+    "ROS 1 bag": lambda f, c: file_writers.bag_of(f / "a.bag", file_writers.wrist_topics(c)),
+    "ROS 2 bag": lambda f, c: file_writers.bag_of(f / "a", file_writers.wrist_topics(c)),
+    "LeRobot v3": lambda f, c: lerobot(f / "a", 3, 50, {k: v for k, v in c.items() if k != "t"}),
+    "CSV of a spreadsheet": lambda f, c: written(f / "a.csv", file_writers.german(c, WRIST_NAMES)),
+    "robomimic": lambda f, c: (
+        f"{file_writers.robomimic_of(f / 'a.hdf5', 50, [file_writers.wrist_vectors(c)])}#demo_0"
+    ),
+}
 
 
-def test_times_that_are_refused_are_told_and_lead_nowhere(tmp_path, capsys):
+def test_times_and_rates_that_contradict_are_told(tmp_path, capsys):
     frame = pd.DataFrame(CARTESIAN)
     pd.concat([frame, frame]).to_csv(tmp_path / "two.csv", index=False)
     assert main(["inspect", str(tmp_path / "two.csv")]) == 0
     said = capsys.readouterr()
     assert "column t: 0 after" in said.err and "the times are not" in said.out and "next:" not in said.out
+    rig = read_rig(NONE / "rig.toml").model_copy(update={"rate": 50.0})
+    trial = read_trial(NONE / "trial_01.csv", rig)
+    assert any("is sampled at 20 Hz, but rate = 50 in rig.toml" in each for each in trial.warnings)
 
 
 def test_another_labs_file_is_read_with_what_inspect_proposes(tmp_path, capsys):
-    """Foreign names, units partly told, finger 2's forces with the other sign, times in ns."""
     ours = dict(CARTESIAN)
     frame = pd.DataFrame({name: ours[channel] * factor for channel, (name, factor) in OTHERS.items()})
     frame["stamp"] = frame["stamp"].round().astype(np.int64)
     frame.to_csv(tmp_path / "a.csv", index=False, sep=";", decimal=",")
     (tmp_path / "rig.toml").write_text("gravity = 9.81\n")
-    assert (
-        main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--json", "-"]) == 0
-    )
+    assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--json",
+                 "-"]) == 0  # fmt: skip
     document = json.loads(capsys.readouterr().out)
     (file,) = document["files"]
     assert file["mapping"]["t"] == {"from": "stamp", "unit": "ns"}
@@ -85,7 +100,7 @@ def test_another_labs_file_is_read_with_what_inspect_proposes(tmp_path, capsys):
         np.testing.assert_allclose(values, ours[name], atol=1e-9, err_msg=name)
 
 
-def test_what_is_in_a_file(tmp_path):
+def test_what_is_in_a_file_a_log_and_a_file_of_several(tmp_path, capsys):
     t = np.delete(np.arange(100) * 0.02, [40, 41, 42, 43, 44])
     force = np.sin(t)
     force[3] = np.nan
@@ -98,14 +113,11 @@ def test_what_is_in_a_file(tmp_path):
     assert left.rate is None and left.missing == 95
     assert (channel.unit, channel.missing, note.text, found.mapping) == ("N", 1, True, {})
     assert channel.maximum == pytest.approx(np.nanmax(force))
-
-
-def test_a_log_and_a_file_of_several(tmp_path, capsys):
-    log = inspect(write_mcap(tmp_path / "a.mcap"))
+    log = inspect(file_writers.mcap_of(tmp_path / "a.mcap", file_writers.planted()))
     rates = {channel.name: channel.rate for channel in log.channels}
     assert rates["/wrench.wrench.force.x"] == pytest.approx(100.0)
     assert rates["/pose.pose.position.z"] == pytest.approx(20.0)
-    path = write_robomimic(tmp_path / "demos.hdf5")
+    path = file_writers.write_robomimic(tmp_path / "demos.hdf5")
     assert main(["inspect", str(path)]) == 0
     assert "the first of 2 recordings (demo_0 ... demo_1)" in " ".join(capsys.readouterr().out.split())
 
@@ -131,8 +143,7 @@ def test_nothing_is_proposed_where_nothing_is_needed(case):
     (["t", "joint1_1", "joint1_2", "joint2_1", "joint2_2", "F1x", "F1y", "F2x", "F2y"],
      {"q11": "joint1_1", "q12": "joint1_2", "q21": "joint2_1", "q22": "joint2_2", "fx1": "F1x",
       "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
-    (["t", "temperature", "pressure"], {}),
-])  # fmt: skip
+    (["t", "temperature", "pressure"], {})])  # fmt: skip
 def test_names_taken_apart(names, expected):
     table = make_table("a", {name: np.zeros(9) for name in names})
     assert {ours: fields["from"] for ours, fields in propose(table).items()} == expected
@@ -163,26 +174,17 @@ def test_an_empty_file_is_refused(tmp_path, capsys, text):
     )
 
 
-def test_a_rate_that_is_not_the_files_is_said(tmp_path):
-    rig = read_rig(NONE / "rig.toml").model_copy(update={"rate": 50.0})
-    trial = read_trial(NONE / "trial_01.csv", rig)
-    assert any("is sampled at 20 Hz, but rate = 50 in rig.toml" in each for each in trial.warnings)
-
-
 @pytest.mark.parametrize(("rig", "line"), [
     ("[columns]\nx1 = 'a'\n", "--write .*rig.toml: already has .columns.; expected a rig without it"),
     ("rate = -1", "rig.toml: key rate: "),
-    ("rate = ", "rig.toml: not valid TOML"),
-])  # fmt: skip
+    ("rate = ", "rig.toml: not valid TOML")])  # fmt: skip
 def test_a_rig_that_cannot_take_the_mapping_stays_as_it_was(tmp_path, capsys, rig, line):
     ours = dict(CARTESIAN)
     pd.DataFrame({"time": ours.pop("t"), **ours}).to_csv(tmp_path / "a.csv", index=False)
     (tmp_path / "rig.toml").write_text(rig)
     assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--quiet"]) == 2
     error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert re.search(line, error)
-    assert (tmp_path / "rig.toml").read_text() == rig
+    assert error.count("\n") == 1 and re.search(line, error) and (tmp_path / "rig.toml").read_text() == rig
 
 
 @pytest.mark.parametrize("hand", ["cartesian", "jointed", "gripper", "none"])
@@ -195,9 +197,8 @@ def test_new_lays_out_files_that_read(tmp_path, hand):
 
 def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
     """`new`, then `inspect --write`: the file's names in the places of those laid out, all else as it was."""
-
     rig = tmp_path / "lab/rig.toml"
-    log = mcap_of(tmp_path / "a.mcap", wrist_topics(WRIST))
+    log = file_writers.mcap_of(tmp_path / "a.mcap", file_writers.wrist_topics(WRIST))
     assert main(["new", str(rig.parent), "--hand", "gripper", "--quiet"]) == 0
     before = rig.read_text()
     assert main(["inspect", str(log), "--write", str(rig), "--quiet"]) == 0
@@ -211,26 +212,21 @@ def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
     assert "already has [gripper]; expected a rig without it" in capsys.readouterr().err
 
 
-def test_new_never_hangs_and_never_writes_over(tmp_path):
+def test_new_fills_in_a_rig_never_hangs_and_never_writes_over(tmp_path, capsys):
     command = [Path(sys.executable).with_name("hmmseg"), "new", "lab"]
     for stdin in (subprocess.DEVNULL, subprocess.PIPE):
-        done = subprocess.run(
-            command, cwd=tmp_path, stdin=stdin, capture_output=True, timeout=60, check=False
-        )
+        done = subprocess.run(command, cwd=tmp_path, stdin=stdin, capture_output=True, timeout=60,
+                              check=False)  # fmt: skip
         text = done.stderr.decode()
         if stdin == subprocess.DEVNULL:
             assert (done.returncode, sorted(os.listdir(tmp_path / "lab"))) == (0, ["rig.toml", "task.toml"])
     assert done.returncode == 2
     assert text == "lab/rig.toml: is there already and would be written over; expected another folder\n"
-
-
-def test_new_fills_in_a_rig_from_a_recording(tmp_path, capsys):
     table = pd.read_csv(NONE / "trial_01.csv")
     table.to_csv(tmp_path / "jointed.csv", index=False)
     assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 0
     text = (tmp_path / "one/rig.toml").read_text()
-    assert "rate = 20.0" in text and "[fingers.1]" in text
-    assert "hmmseg segment" in capsys.readouterr().out
+    assert "rate = 20.0" in text and "[fingers.1]" in text and "hmmseg segment" in capsys.readouterr().out
     assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 2
 
 
@@ -251,39 +247,16 @@ def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
     found = Map.from_toml(tmp_path / "map.toml")
     assert {n: (m.thing, m.kind) for n, m in found.columns.items()} == {
         "elbow_deg": ("joint", "position"), "elbow_vel": ("joint", "velocity"),
-        "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force"),
-    }  # fmt: skip
+        "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force")}  # fmt: skip
     assert (found.clock.column, found.clock.size) == ("ros_stamp", 1e-9)
     assert main(["new", str(tmp_path / "other"), "--model", str(tmp_path / "robot.xml")]) == 2
 
 
-FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
-RATE = 20
-SIDES = {"1": "links", "2": "rechts"}
-FINGER_NAMES = {
-    name: (f"Finger_{SIDES[name[1]]}_{name[0]}_mm", 1e3) if len(name) == 2
-    else (f"Kraft_{SIDES[name[2]]}_{name[1]}_N", 1.0)
-    for name in FINGERS if name != "t"
-}  # fmt: skip
-WRIST_NAMES = {"width": ("Oeffnung_mm", 1e3), "ee_y": ("TCP_y_mm", 1e3), "ee_z": ("TCP_z_mm", 1e3),
-               **{f"F{axis}": (f"F{axis}_N", 1.0) for axis in "xyz"}}  # fmt: skip
-
-
 def lerobot(folder, version, rate, columns):
     states = np.stack(list(columns.values()), axis=1)
-    lerobot_of(folder, version, rate, list(columns), [states, states], [np.zeros((len(states), 2))] * 2)
+    file_writers.lerobot_of(folder, version, rate, list(columns), [states, states],
+                            [np.zeros((len(states), 2))] * 2)  # fmt: skip
     return f"{folder}#1"
-
-
-FINGER_FILES = {
-    "MCAP": lambda f: mcap_of(f / "a.mcap", finger_topics(FINGERS)),
-    "ROS 1 bag": lambda f: bag_of(f / "a.bag", finger_topics(FINGERS)),
-    "ROS 2 bag": lambda f: bag_of(f / "a", finger_topics(FINGERS)),
-    "LeRobot v2": lambda f: lerobot(f / "a", 2, RATE, finger_columns(FINGERS)),
-    "LeRobot v3": lambda f: lerobot(f / "a", 3, RATE, finger_columns(FINGERS)),
-    "robomimic": lambda f: f"{robomimic_of(f / 'a.hdf5', RATE, [finger_vectors(FINGERS)] * 2)}#demo_1",
-    "CSV of a spreadsheet": lambda f: written(f / "a.csv", german(FINGERS, FINGER_NAMES)),
-}
 
 
 def written(path, data):
@@ -306,22 +279,11 @@ def test_two_fingers_read_as_recorded(tmp_path, kind):
 
 @pytest.fixture(scope="module")
 def wrist():
-    """A wrist's recording under the names of the arm that another simulator recorded."""
     setup = Setup(axes=("x", "y", "z"))
     columns = wrist_recording(performances(1)[0], setup)
     names = {"gap": "width", "py": "ee_y", "pz": "ee_z", "Fx": "Fx", "Fy": "Fy", "Fz": "Fz"}
     out = {"t": columns["t"]} | {theirs: columns[ours] for ours, theirs in names.items()}
     return out | {f"T{axis}": 0 * columns["t"] for axis in "xyz"}
-
-
-WRIST_FILES = {
-    "MCAP": lambda f, c: mcap_of(f / "a.mcap", wrist_topics(c)),
-    "ROS 1 bag": lambda f, c: bag_of(f / "a.bag", wrist_topics(c)),
-    "ROS 2 bag": lambda f, c: bag_of(f / "a", wrist_topics(c)),
-    "LeRobot v3": lambda f, c: lerobot(f / "a", 3, 50, {k: v for k, v in c.items() if k != "t"}),
-    "CSV of a spreadsheet": lambda f, c: written(f / "a.csv", german(c, WRIST_NAMES)),
-    "robomimic": lambda f, c: f"{robomimic_of(f / 'a.hdf5', 50, [wrist_vectors(c)])}#demo_0",
-}
 
 
 @pytest.mark.parametrize("kind", WRIST_FILES)
@@ -332,9 +294,8 @@ def test_a_wrist_reads_as_recorded(tmp_path, wrist, kind, capsys):
     file, rig = WRIST_FILES[kind](tmp_path, wrist), tmp_path / "rig.toml"
     assert main(["inspect", str(file), "--write", str(rig), "--quiet"]) == 0
     if kind == "robomimic":  # its second finger counts the other way, and the line says so
-        task = written(
-            tmp_path / "task.toml", b'[objects.a]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n'
-        )
+        task = written(tmp_path / "task.toml",
+                       b'[objects.a]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n')  # fmt: skip
         assert main(["segment", str(file), "--task", str(task), "--rig", str(rig)]) == 2
         line = capsys.readouterr().err
         entry = line.split("expected ")[1].split(" under [columns]")[0]
@@ -342,6 +303,5 @@ def test_a_wrist_reads_as_recorded(tmp_path, wrist, kind, capsys):
     trial = read_trial(file, read_rig(rig))
     assert trial.warnings == ()
     for name in ("x1", "y1", "fy1", "x2", "y2", "fy2"):
-        np.testing.assert_allclose(
-            trial.channels[name], expected.channels[name], atol=1e-3 * (name[0] == "f") + 2e-5
-        )
+        np.testing.assert_allclose(trial.channels[name], expected.channels[name],
+                                   atol=1e-3 * (name[0] == "f") + 2e-5)  # fmt: skip

@@ -44,7 +44,6 @@ def test_trials_are_written_as_a_folder_of_recordings(tmp_path, inputs):
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {
         "trial_01_signals.png", "trial_02_signals.png"}  # fmt: skip
     assert all((tmp_path / name).exists() for name in document["files"])
-
     again = tmp_path / "again"
     assert main([*args[:-4], "--output", str(again), "--json", str(report)]) == 0
     assert (again / "trial_02.csv").read_bytes() == (out / "trial_02.csv").read_bytes()
@@ -52,8 +51,7 @@ def test_trials_are_written_as_a_folder_of_recordings(tmp_path, inputs):
 
 @pytest.mark.parametrize("more", [
     '[columns]\nt = {from = "stamp", unit = "ms"}\nx1 = {from = "left [mm]", unit = "mm"}\n',
-    '[gripper]\nposition = ["x", "y", "z"]\nopening = "w"\nwrench = ["fx", "fy", "fz"]\n',
-])  # fmt: skip
+    '[gripper]\nposition = ["x", "y", "z"]\nopening = "w"\nwrench = ["fx", "fy", "fz"]\n'])  # fmt: skip
 def test_the_rig_that_is_written_reads_the_trials_that_are(tmp_path, inputs, more):
     (tmp_path / "rig.toml").write_text("rate = 50.0\n" + more)
     out = tmp_path / "out"
@@ -70,8 +68,7 @@ def test_a_replay_predicts_the_recording_s_forces(tmp_path, inputs):
     assert main([*args, "--replay", str(made / "trial_01.csv"), "--output", str(out), "--json", str(report),
                  "--figures", str(tmp_path / "figures")]) == 0  # fmt: skip
     rest = json.loads(report.read_text())["replay"]["net_force_residual_over_noise"]
-    assert rest["free-motion"] < 1.5
-    assert rest["hold-above-ground"] < 1.5
+    assert rest["free-motion"] < 1.5 and rest["hold-above-ground"] < 1.5
     rig = read_rig(out / "rig.toml")
     recorded, predicted = (read_trial(folder / "trial_01.csv", rig) for folder in (made, out))
     assert (recorded.channels["q11"] == predicted.channels["q11"]).all()
@@ -82,14 +79,12 @@ def test_a_replay_predicts_the_recording_s_forces(tmp_path, inputs):
     (["--output", "."], "would replace the input"),
     (["--replay", "trial.csv", "--trials", "2"], "goes with neither"),
     (["--properties", "none.json"], "none.json: no such file"),
-    (["--operator", "operator.toml"], "unknown key; expected one of"),
-])  # fmt: skip
+    (["--operator", "operator.toml"], "unknown key; expected one of")])  # fmt: skip
 def test_what_is_refused_writes_nothing(tmp_path, inputs, more, message, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "operator.toml").write_text("gripp = 2.0\n")
     before = sorted(tmp_path.iterdir())
-    assert main(["simulate", *inputs, *more]) == 2
-    assert message in capsys.readouterr().err
+    assert main(["simulate", *inputs, *more]) == 2 and message in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == before
 
 

@@ -31,7 +31,7 @@ def run(monkeypatch, capsys):
     return run
 
 
-def test_one_line_a_row_and_a_last_one(run, tmp_path):
+def test_one_line_a_row_and_a_last_one_or_a_live_picture_of_where_the_task_is(run, tmp_path):
     code, lines, err = run(ROWS, "--json", str(tmp_path / "out.json"))
     assert code == 0 and err == ""
     assert len(lines) == len(ROWS)  # the header's place is taken by the last line
@@ -39,6 +39,19 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
     assert lines[-1]["final"] and lines[-1]["fits"] and lines[-1]["format"] == "hmmseg.watch/1"
     assert [s["subtask"] for s in lines[-1]["segments"]][:3] == ["pregrasp", "pickup", "carry"]
     assert json.loads((tmp_path / "out.json").read_text())["segments"] == lines[-1]["segments"]
+    watcher = Watcher(COMMAND[2], COMMAND[4])
+    live = Live(watcher)
+    live._console.file = io.StringIO()
+    for row in ROWS[1:60]:
+        t, *values = map(float, row.split(","))
+        answer = watcher.update(t, values)
+        live.update(answer)
+    live.close()
+    console = Console(file=io.StringIO(), width=140)
+    console.print(picture(watcher, answer, list(live._kept), ["a note"]))
+    text = console.file.getvalue()
+    assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
+    assert spark([0.0, float("nan"), 2.0]) == "▁ █ 2.00 N at most"
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -50,16 +63,13 @@ def test_one_line_a_row_and_a_last_one(run, tmp_path):
     (lambda rows: rows[:1], "the stream: has no rows; expected a row for every sample"),
     (
         lambda rows: [*rows[:5], re.sub(",[^,]*$", ",1e300", rows[5]), *rows[6:]],
-        "row 6, column fy2: 1e+300 is no",
-    ),
-])  # fmt: skip
+        "row 6, column fy2: 1e+300 is no")])  # fmt: skip
 def test_bad_input_gets_one_line(run, change, message):
     code, _, err = run(change(ROWS[:10]))
-    assert code == 2
-    assert len(err.splitlines()) == 1 and message in err
+    assert code == 2 and len(err.splitlines()) == 1 and message in err
 
 
-def test_angles_in_degrees_are_refused_as_in_a_file(run):
+def test_degrees_and_ms_are_refused_as_in_a_file(run):
     cells = [row.split(",") for row in ROWS[1:110]]
     angles = [k for k, name in enumerate(ROWS[0].split(",")) if name[0] in "qd"]
     rows = [",".join(str(57.3 * float(c)) if k in angles else c for k, c in enumerate(row)) for row in cells]
@@ -67,9 +77,6 @@ def test_angles_in_degrees_are_refused_as_in_a_file(run):
     assert code == 2 and "it looks like deg; expected q" in err
     wild = [*ROWS[:60], ",".join([ROWS[60].split(",")[0], *["999"] * 12]), *ROWS[61:110]]
     assert run(wild)[0] == 0  # a single row is no unit
-
-
-def test_times_in_ms_are_refused_as_in_a_file(run):
     cells = [row.split(",", 1) for row in ROWS[1:110]]
     rows = [f"{1e3 * float(t):g},{rest}" for t, rest in cells]
     code, _, err = run([ROWS[0], *rows])
@@ -78,9 +85,7 @@ def test_times_in_ms_are_refused_as_in_a_file(run):
 
 
 def test_a_stream_as_a_spreadsheet_has_it(run):
-    """Semicolons, decimal commas, remarks, a row of units and ISO stamps: the answers of the plain stream."""
-    plain = run(ROWS[:60])[1]
-    table = [row.split(",") for row in ROWS[:60]]
+    plain, table = run(ROWS[:60])[1], [row.split(",") for row in ROWS[:60]]
     units = ["" if name == "t" else "N" if name[0] == "f" else "rad/s" if name[0] == "d" else "rad"
              for name in table[0]]  # fmt: skip
     start = datetime.fromisoformat("2026-03-02T10:15:30+01:00")
@@ -103,34 +108,13 @@ def test_a_rig_without_pads_is_told(run, tmp_path, left_out):
     assert code == 0 and any("states no [fingertip]" in line for line in lines[-1]["warnings"])
 
 
-def test_bad_rows_can_be_left_out(run):
+def test_bad_rows_and_one_that_breaks_off_can_be_left_out(run):
     rows = [*ROWS[:5], "garbage", *ROWS[5:20]]
     code, lines, err = run(rows, "--skip-bad-rows")
-    assert code == 0 and len(lines) == 20
-    assert "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
-
-
-def test_a_stream_that_ends_in_the_middle_of_a_row(run):
-    """As a file that does: the row is left out with a warning, and the last line is written."""
+    assert code == 0 and len(lines) == 20 and "row 6: has 1 cells" in err and lines[-1]["counts"]["bad"] == 1
     code, lines, err = run([*ROWS[:20], ROWS[20][:30]], end="")
     assert code == 0 and len(lines) == 20 and lines[-1]["final"] and lines[-1]["counts"]["rows"] == 19
     assert lines[-1]["warnings"] == ["standard input: row 21, the last, is cut off and left out"]
     assert lines[-1]["warnings"][0] in err
     whole = run(ROWS[:20], end="")[1]
     assert whole[-1]["counts"] == lines[-1]["counts"] and whole[-1]["segments"] == lines[-1]["segments"]
-
-
-def test_the_live_picture_shows_where_the_task_is():
-    watcher = Watcher(COMMAND[2], COMMAND[4])
-    live = Live(watcher)
-    live._console.file = io.StringIO()
-    for row in ROWS[1:60]:
-        t, *values = map(float, row.split(","))
-        answer = watcher.update(t, values)
-        live.update(answer)
-    live.close()
-    console = Console(file=io.StringIO(), width=140)
-    console.print(picture(watcher, answer, list(live._kept), ["a note"]))
-    text = console.file.getvalue()
-    assert "carry block1" in text and "fits its task" in text and "a note" in text and "grip" in text
-    assert spark([0.0, float("nan"), 2.0]) == "▁ █ 2.00 N at most"

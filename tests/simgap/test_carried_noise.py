@@ -7,7 +7,6 @@ import pytest
 from demo_recordings import recorded
 
 from hmmseg.io.trial import Trial
-from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms, of_noise, products
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines, spectrum
@@ -22,10 +21,8 @@ GIVE, FORCE_SD, PLACE_SD, TRIALS, SAMPLES = 1.0, 1.0, 0.3, 4, 150
 
 
 def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
-    """A place that a force moves through a pad, place = (GIVE + true) force, both with noise; the effect is
-    another give. `swing`: sd of the true force; `error`: sd of what moves the place besides."""
-    rng = np.random.default_rng(seed)
-    n = TRIALS * SAMPLES
+    """A place that a force moves, place = (GIVE + true) force, with noise; the effect is another give."""
+    rng, n = np.random.default_rng(seed), TRIALS * SAMPLES
     trial, k = np.divmod(np.arange(n), SAMPLES)
     nothing = np.zeros(n, int)
     rows = Rows(trial, nothing, nothing, k / 20.0, tuple(f"t{i}" for i in range(TRIALS)), ("c",), ("p",))
@@ -42,7 +39,6 @@ def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
             columns = np.stack([place - GIVE * force, np.zeros(n), force], 1) / sd + one
         else:
             draws.append(one)
-    assert columns is not None
     far, zero = np.full(1, np.inf), np.zeros(1)
     pad = Candidate("softer", ("give",), zero, zero, np.ones(1), columns[:, 1], columns[:, 2:], -far, far)
     return Gap(rows, columns[:, 0], np.zeros((n, 0)), (pad,), carried=np.stack(draws) / np.sqrt(len(draws)))
@@ -53,9 +49,7 @@ def linearised(gap: Gap) -> Gap:
     (pad,) = gap.candidates
     own = pad.jacobian[:, 0]
     at = np.array([own @ gap.residual / (own @ own)])
-    more = replace(pad, at=at, shift=own * at[0])
-    assert gap.carried is not None
-    noise = gap.carried.copy()
+    more, noise = replace(pad, at=at, shift=own * at[0]), gap.carried.copy()
     noise[:, :, 1] = at[0] * noise[:, :, 2]
     return replace(gap, candidates=(more,), carried=noise)
 
@@ -63,13 +57,11 @@ def linearised(gap: Gap) -> Gap:
 def test_products_of_noise_are_their_expectations():
     gap = linearised(softer(0.0, 0.0))
     s, (pad,) = spectrum(gap), gap.candidates
-    found = of_noise(gap, s)[:, :, :].sum(0)
-    variance = np.hypot(PLACE_SD, GIVE * FORCE_SD) ** 2
+    found, variance = of_noise(gap, s)[:, :, :].sum(0), np.hypot(PLACE_SD, GIVE * FORCE_SD) ** 2
     n, at = gap.residual.size, pad.at[0]
     with_residual, square = -GIVE * FORCE_SD**2 / variance * n, FORCE_SD**2 / variance * n
     # About `at`: d0'J stays, the constant part is at J - at J, and no curvature is taken off.
-    assert found[0, 0] == 0 and found[2, 2] == 0
-    assert found[0, 2] == pytest.approx(with_residual, rel=0.15)
+    assert found[0, 0] == 0 and found[2, 2] == 0 and found[0, 2] == pytest.approx(with_residual, rel=0.15)
     assert found[0, 1] == pytest.approx(0.0, abs=0.02 * n)
     assert found[1, 2] == pytest.approx(at * square, rel=0.15)
     assert found[1, 1] == pytest.approx(-(at**2) * square, rel=0.15)
@@ -77,16 +69,12 @@ def test_products_of_noise_are_their_expectations():
 
 
 @pytest.mark.parametrize("error", [0.0, 1.0])
-def test_noise_alone_is_no_effect(error):
+def test_noise_alone_is_no_effect_and_an_effect_has_its_own_size(error):
     gap = linearised(softer(0.0, 1.0, error=error))
     blind, told = forms(replace(gap, carried=None)), forms(gap)
     gained = [fitted(f, (0,)).score - fitted(f, ()).score for f in (blind, told)]
     assert gained[0] > 25.0  # stiffer pads leave less of the force's noise
     assert gained[1] < 2.0
-
-
-@pytest.mark.parametrize("error", [0.0, 1.0])
-def test_an_effect_has_its_own_size(error):
     found = []
     for seed in range(6):
         gap = linearised(softer(0.5, 4.0, seed, error))
@@ -98,16 +86,13 @@ def test_an_effect_has_its_own_size(error):
 
 @pytest.fixture(scope="module")
 def given():
-    frame = double_precision(lambda: build(align(*recorded("none_1", 4))))()
-    return double_precision(lambda: with_nuisances(problem(frame)))()
+    return with_nuisances(problem(build(align(*recorded("none_1", 4)))))
 
 
-@double_precision
 def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_by(given):
     healthy = fit(given, (), neutral(given))
-    noise = carried(
-        healthy.residual[:, None], redrawn(given), lambda other: on_other(other, healthy).residual[:, None]
-    )
+    noise = carried(healthy.residual[:, None], redrawn(given),
+                    lambda other: on_other(other, healthy).residual[:, None])  # fmt: skip
     there, arrays = given.there, given.frame.arrays
     channel, doubted = np.nonzero(there)[2], (arrays.sd / arrays.plain)[there]
     square = np.square(noise[..., 0] * doubted).sum(0)
@@ -115,7 +100,6 @@ def test_residuals_of_redrawn_recordings_have_the_noise_that_they_are_measured_b
         assert square[channel == c].mean() == pytest.approx(1.0, abs=0.2)
 
 
-@double_precision
 @pytest.mark.parametrize("shown", [0.9999, 1.0001])
 def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(given, shown, monkeypatch):
     """The most visible one is hardly a candidate, or the least visible one just is."""
@@ -125,18 +109,15 @@ def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(giv
     monkeypatch.setattr(assemble, "SHOWN", (min(size) if shown > 1 else max(size)) / shown)
     gap = gap_of(measured, healthy, [], (), redrawn(measured))
     names = [p for c in gap.candidates for p in c.parameters]
-    assert gap.carried is not None and gap.carried.shape[2] == gap.raw_columns.shape[1]
+    assert gap.carried.shape[2] == gap.raw_columns.shape[1]
     assert len(names) == (given.sd.size if shown > 1 else 0)
 
 
-def test_where_noise_does_not_act_in_proportion_nothing_is_said():
+def test_what_is_lost_or_does_not_act_in_proportion_is_missing():
     force = np.array([[0.5], [-0.9], [3.0]])
     contact = lambda step: np.maximum(force + step, 0.0)  # noqa: E731 - noise makes the second contact, at full size
     noise = carried(contact(0.0), SIZES * 2, contact)
     np.testing.assert_allclose(np.square(noise[..., 0]).sum(0), [1.0, 0.0, 1.0], rtol=1e-6)
-
-
-def test_a_reading_lost_in_a_grip_is_missing_and_a_gap_between_two_taps_is_not():
     t = np.arange(12) / 100
     grip = np.array([0, 0, 2.0, 2.1, 0.01, 2.0, 2.0, 0, 0, 0.5, 0, 3.0])
     channels = {"fx1": grip, "fy1": 0.2 * grip, "fx2": -grip, "fy2": 0.2 * grip, "x1": t}
@@ -152,12 +133,10 @@ def test_rounding_shows_in_a_force_that_moves_and_not_in_one_that_rests_or_jumps
     force += 2e-3 * np.random.default_rng(0).standard_normal(force.shape)
     read = 0.05 * np.round(force / 0.05)
     step = rounding_step([read[:500], read[500:]])
-    assert step == pytest.approx(0.05, rel=1e-3)
-    assert rounding_step([force]) == 0.0
+    assert step == pytest.approx(0.05, rel=1e-3) and rounding_step([force]) == 0.0
     true, shown = read - force, rounding_error(read, step)
     left = np.std(true - shown, axis=0) / np.std(true, axis=0)
-    assert (left[:2] < 0.5).all()
-    assert np.abs(shown[:, 2:]).max() < 1e-9
+    assert (left[:2] < 0.5).all() and np.abs(shown[:, 2:]).max() < 1e-9
 
 
 @pytest.mark.parametrize("size", [0.3, 1.5, 8.0, 20.0])

@@ -17,23 +17,22 @@ quantisation joint_offset link_length backlash clock_jitter fingertip_compliance
 fingertip_mass grip_slip object_inertia offcentre_mass table_tilt table_compliance cable_force
 viscous_drag structural_vibration contact_impact hand_roll actual
 """
-RIG = Rig(
-    fingers={
-        "1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
-        "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12)),
-    },
-    fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0),
-)
+RIG = Rig(fingers={"1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
+                   "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12))},
+          fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))  # fmt: skip
 DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
+PLANTED = {"force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
+           "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
+           "force_gain": {"gain": 0.08}, "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
+           "sensor_rotation": {"angle1": 0.05, "angle2": -0.04}, "viscous_drag": {"coefficient": 0.7},
+           "fingertip_mass": {"mass": 0.012}, "contact_impact": {"impulse": 0.02}}  # fmt: skip
 
 
 def performance(n: int = 400) -> Performance:
-    """Fingers that go round slowly and press in the second half."""
     t = np.arange(n) * 5e-3
     x, y = 0.12 + 0.02 * np.sin(3 * t), 0.03 + 0.01 * np.cos(2 * t)
     position = np.stack([np.stack([x - 0.01, y], 1), np.stack([x + 0.01, y], 1)], 1)
-    velocity = np.gradient(position, t, axis=0)
-    grip = 2.0 / (1 + np.exp(-(t - 1.0) / 0.03))
+    velocity, grip = np.gradient(position, t, axis=0), 2.0 / (1 + np.exp(-(t - 1.0) / 0.03))
     force = np.stack([np.stack([grip, 0.2 * grip], 1), np.stack([-grip, 0.25 * grip], 1)], 1)
     held = (t > 1.2).astype(float)
     load, width = 0.5 * held, np.where(held > 0, 0.02, 1.0)
@@ -44,20 +43,18 @@ def world_of(p: Performance) -> World:
     """The world that the nominal hand records of a performance, every tenth sample."""
     k = slice(None, None, 10)
     joints = np.concatenate([inverse(RIG.finger(i), i, p.position[k, i - 1]) for i in (1, 2)], 1)
-    rates = np.gradient(joints, p.t[k], axis=0)
-    held = (p.t[k] > 1.0).astype(float)
+    rates, held = np.gradient(joints, p.t[k], axis=0), (p.t[k] > 1.0).astype(float)
     carry = ((p.t[k] > 1.2) & (p.t[k] < 1.6)).astype(float)
     one, zero = np.ones(()), np.zeros(())
-    return World(
-        t=p.t[k][None], joints=joints[None], rates=rates[None], force=flat(p)[k][None],
-        load=np.zeros((1, held.size, 4)), base=np.array([0.05, 0.17, 0.21, 0.17]), length=np.full(4, 0.12),
-        jointed=one, gravity=9.81 * one, link=np.ones(4), give_normal=np.full(2, 1 / 4000),
-        give_shear=np.full(2, 1 / 2500), delay=np.zeros(4), smoothing=np.zeros(4), creep=zero, creep_time=one,
-        tilt=zero, give_support=zero, support_time=zero, inertia=one, couple=zero,
-        loudness=np.ones((1, held.size, 4)), ring=np.array([1.0, 0.05, 0.0]), slip=np.zeros((1, held.size)),
-        modes=np.zeros(6), free=1 - held[None], ground=(held - carry)[None], carry=carry[None],
-        events=p.events[None],
-    )  # fmt: skip
+    return World(t=p.t[k][None], joints=joints[None], rates=rates[None], force=flat(p)[k][None],
+                 load=np.zeros((1, held.size, 4)), base=np.array([0.05, 0.17, 0.21, 0.17]),
+                 length=np.full(4, 0.12), jointed=one, gravity=9.81 * one, link=np.ones(4),
+                 give_normal=np.full(2, 1 / 4000), give_shear=np.full(2, 1 / 2500), delay=np.zeros(4),
+                 smoothing=np.zeros(4), creep=zero, creep_time=one, tilt=zero, give_support=zero,
+                 support_time=zero, inertia=one, couple=zero, loudness=np.ones((1, held.size, 4)),
+                 ring=np.array([1.0, 0.05, 0.0]), slip=np.zeros((1, held.size)), modes=np.zeros(6),
+                 free=1 - held[None], ground=(held - carry)[None], carry=carry[None],
+                 events=p.events[None])  # fmt: skip
 
 
 def test_every_name_of_the_contract_is_an_effect():
@@ -75,21 +72,8 @@ def test_an_effect_that_is_off_changes_nothing_and_is_finite_where_a_fit_begins(
         start = {p.name: p.starts[which] if p.starts else p.nominal for p in effect.parameters.values()}
         steps = [{**start, p.name: p.value(p.coordinate(start[p.name]) + STEP)}
                  for p in effect.parameters.values()]  # fmt: skip
-        assert all(
-            np.isfinite(z).all() for v in (start, *steps) for z in tree_leaves(effect.correct(world, v, 1.0))
-        )
-
-
-PLANTED = {
-    "force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
-    "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
-    "force_gain": {"gain": 0.08},
-    "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
-    "sensor_rotation": {"angle1": 0.05, "angle2": -0.04},
-    "viscous_drag": {"coefficient": 0.7},
-    "fingertip_mass": {"mass": 0.012},
-    "contact_impact": {"impulse": 0.02},
-}
+        assert all(np.isfinite(z).all() for v in (start, *steps)
+                   for z in tree_leaves(effect.correct(world, v, 1.0)))  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sorted(PLANTED))
@@ -124,8 +108,7 @@ def test_a_mass_off_the_middle_turns_the_block_until_moments_balance():
 
 @pytest.mark.parametrize(("name", "values"), [
     ("joint_offset", {"q11": 0.01, "q12": -0.005, "q21": 0.0, "q22": 0.02}),
-    ("link_length", {"scale": 0.02}),
-])  # fmt: skip
+    ("link_length", {"scale": 0.02})])  # fmt: skip
 def test_kinematic_effects_are_undone_in_tip_positions(name, values):
     truth, effect = performance(), catalogue()[name]
     recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))
@@ -147,7 +130,7 @@ def test_what_crosstalk_makes_of_noise_is_known():
     np.testing.assert_allclose(seen.std(axis=(0, 1)), 0.01, rtol=0.02)
 
 
-def test_a_drag_before_a_late_sensor_is_late_as_well():
+def test_what_is_nearest_to_the_recorded_number_is_put_in_last_and_taken_out_first():
     truth, drag, lag = performance(), catalogue()["viscous_drag"], catalogue()["force_lag"]
     late = lag.apply(drag.apply(truth, {"coefficient": 5.0}, None), {"delay": 0.1}, None)
     world = world_of(late)
@@ -156,17 +139,6 @@ def test_a_drag_before_a_late_sensor_is_late_as_well():
     off = np.abs(contact(world) - world_of(truth).force)[:, 3:-15]
     put_in = np.abs(world_of(late).force - world_of(truth).force)[:, 3:-15]
     assert off.max() < 0.1 * put_in.max()
-
-
-def test_pads_that_carry_a_block_hold_it():
-    # Friction far too low to hang a block from would let all of its heights go free.
-    world, slip = world_of(performance()), catalogue()["grip_slip"]
-    low = slip.correct(world, {"mu": 0.08}, 1.0)
-    carried = np.asarray(world.carry)
-    assert carried.sum() > 3 and (np.asarray(low.slip) * carried).sum() <= 0.2 * carried.sum()
-
-
-def test_a_bias_is_added_after_the_gain():
     truth = performance()
     gain, bias = catalogue()["force_gain"], catalogue()["force_bias"]
     values = dict.fromkeys(("fx1", "fy1", "fx2", "fy2"), 0.1)
@@ -179,6 +151,10 @@ def test_a_bias_is_added_after_the_gain():
     np.testing.assert_allclose(contact(world), world_of(truth).force, atol=1e-12)
 
 
-def test_quantised_forces_lie_on_the_lattice():
+def test_pads_that_carry_a_block_hold_it_and_quantised_forces_lie_on_the_lattice():
+    # Friction far too low to hang a block from would let all of its heights go free.
+    world, slip = world_of(performance()), catalogue()["grip_slip"]
+    low, carried = slip.correct(world, {"mu": 0.08}, 1.0), np.asarray(world.carry)
+    assert carried.sum() > 3 and (np.asarray(low.slip) * carried).sum() <= 0.2 * carried.sum()
     force = catalogue()["quantisation"].finish(np.array([0.013, -0.049, 1.234]), {"step": 0.02})
     np.testing.assert_allclose(force, [0.02, -0.04, 1.24])

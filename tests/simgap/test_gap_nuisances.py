@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from demo_recordings import recorded
 
-from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import align
 from simgap.attribution.problem import Rows
 from simgap.effects import catalogue
@@ -20,7 +19,7 @@ from simgap.gap.residuals import _misread_moment, residuals, turned
 from simgap.phases import Phase
 
 
-def test_products_are_those_of_the_marginal_density():
+def test_products_are_marginal_and_a_finger_that_presses_on_is_no_gap():
     rng = np.random.default_rng(0)
     columns, a, b = rng.normal(size=(30, 4)), rng.normal(size=(30, 3)), rng.normal(size=30)
     columns[:, 3] = columns[:, 2]  # the same unknown twice
@@ -29,6 +28,11 @@ def test_products_are_those_of_the_marginal_density():
     np.testing.assert_allclose(nuisances.product(a, b), a.T @ inverse @ b, atol=1e-10)
     np.testing.assert_allclose(nuisances.product(a, a), a.T @ inverse @ a, atol=1e-10)
     np.testing.assert_allclose(nuisances.left(b), inverse @ b, atol=1e-10)
+    t, force = np.arange(10) / 20.0, np.zeros((10, 4))
+    force[0] = -0.065, 0.02, -0.30, -0.41  # the right finger leaves last, while the left one rings
+    force[1] = 0.3, 0.2, -0.3, 0.2  # late forces of both
+    found = _one_finger(t, force, np.zeros(10, int), np.ones(10, bool), np.array([0.0]), np.full(10, 0.01))
+    np.testing.assert_array_equal(np.flatnonzero(found), [0])
 
 
 @pytest.mark.parametrize(("level", "colour"), [(1.0, 0.0), (1.3, 0.0), (0.8, 0.3)])
@@ -38,13 +42,12 @@ def test_level_and_colour_are_found_beside_a_loud_stretch(level, colour):
     square = level**2 * _density(turn, colour) * rng.standard_normal(turn.size) ** 2
     square[turn < 0.3] *= 50.0  # an effect: slow and large
     found = _likeliest(turn, square)
-    assert found[0] == pytest.approx(level, rel=0.08)
-    assert found[1] == pytest.approx(colour, abs=0.08)
+    assert found[0] == pytest.approx(level, rel=0.08) and found[1] == pytest.approx(colour, abs=0.08)
 
 
 @pytest.fixture(scope="module")
 def given():
-    return double_precision(lambda: problem(build(align(*recorded("none_1", 2)))))()
+    return problem(build(align(*recorded("none_1", 2))))
 
 
 def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
@@ -53,7 +56,6 @@ def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
     rows = Rows(trial, channel, given.frame.arrays.subtask[trial, sample], given.frame.world.t[trial, sample],
                 given.frame.files, CHANNELS, tuple(map(str, range(len(given.frame.steps)))))  # fmt: skip
     sd = with_noise(given, rows, np.random.default_rng(2).standard_normal(trial.size)).sd
-    assert sd is not None
     for c, name in enumerate(CHANNELS):
         low, high = (0.55, 1.5) if name in ("vx", "vy") else (0.9, 1.1)
         assert low < np.sqrt(np.mean(sd[channel == c] ** 2)) < high, name
@@ -61,12 +63,16 @@ def test_noise_is_as_stated_in_the_mean_where_it_is_white_noise(given):
     assert slow.any()  # three samples averaged: louder at low frequencies
 
 
-@double_precision
-def test_blocks_settle_in_the_offset_and_height_alone(given):
+def test_blocks_settle_in_the_offset_and_height_alone_and_turn_once_loads_leave_their_feet(given):
     channel, settling = np.nonzero(given.there)[2], _settling(given)
     assert len(settling) == 3 * given.frame.num_trials * given.frame.arrays.onehot.shape[2]
     for column in settling:
         assert set(channel[np.abs(column[:, 0]) > 1e-9]) <= {CHANNELS.index("offset"), CHANNELS.index("y")}
+    world, one = given.frame.world._replace(carry=np.zeros((1, 1))), np.ones((1, 1))
+    for apart, tips_over in ((1e-4, False), (3e-3, True)):
+        force = np.array([[[4.0, 0.05, -4.0, 0.05]]])
+        turn, rise, _ = turned(world, 0.4 * one, 0.02 * one, np.array([5.0, 0.0]), force, apart * one)
+        assert (turn[0, 0] > 0) == (rise[0, 0] > 0) == tips_over
 
 
 @pytest.mark.parametrize("off", [0.0, 0.004, -0.002])
@@ -82,28 +88,12 @@ def test_a_lifted_block_turns_until_its_moments_balance(given, off):
     force = np.array([[[grip, (weight - lift) / 2, -grip, (weight + lift) / 2]]])
     world = given.frame.world._replace(couple=np.asarray(off), carry=np.ones((1, 1)))
     one = np.ones((1, 1))
-    found, rise, ease = turned(
-        world,
-        weight * one,
-        width * one,
-        np.array([0.3, 0.7]) * compliance,
-        force,
-        one * (heights + width * turn),
-    )
-    assert found[0, 0] == pytest.approx(turn)
-    assert rise[0, 0] == 0.0
+    found, rise, ease = turned(world, weight * one, width * one, np.array([0.3, 0.7]) * compliance, force,
+                               one * (heights + width * turn))  # fmt: skip
+    assert found[0, 0] == pytest.approx(turn) and rise[0, 0] == 0.0
     assert ease[0, 0] == pytest.approx(compliance)
 
 
-def test_a_standing_block_turns_only_once_its_load_leaves_its_feet(given):
-    world, one = given.frame.world._replace(carry=np.zeros((1, 1))), np.ones((1, 1))
-    for apart, tips_over in ((1e-4, False), (3e-3, True)):
-        force = np.array([[[4.0, 0.05, -4.0, 0.05]]])
-        turn, rise, _ = turned(world, 0.4 * one, 0.02 * one, np.array([5.0, 0.0]), force, apart * one)
-        assert (turn[0, 0] > 0) == (rise[0, 0] > 0) == tips_over
-
-
-@double_precision
 @pytest.mark.parametrize("compliance", [0.0, 5.0, 15.0])
 def test_an_offset_is_as_noisy_as_the_moment_that_turns_its_block(given, compliance):
     """Monte Carlo: noise of heights and shears through the equation itself."""
@@ -126,7 +116,6 @@ def test_an_offset_is_as_noisy_as_the_moment_that_turns_its_block(given, complia
     assert noise == pytest.approx(np.std(apart - width * turn), rel=0.03)
 
 
-@double_precision
 def test_columns_of_late_speeds_hold_no_noise_of_the_speeds(given):
     """Fitted to it they would smooth it, and its level would come out too low."""
     world, shape = given.frame.world, given.frame.world.rates.shape
@@ -139,10 +128,8 @@ def test_columns_of_late_speeds_hold_no_noise_of_the_speeds(given):
         np.testing.assert_array_equal(before, after)
 
 
-@double_precision
 def test_a_block_that_turns_frees_all_but_where_it_stands(given):
-    free = np.zeros(given.weight.shape)
-    there = given.there
+    free, there = np.zeros(given.weight.shape), given.there
     free[there] = turned_variance(given, 0.02)
     phase = given.frame.arrays.phase
     for c, name in enumerate(CHANNELS):
@@ -157,7 +144,6 @@ def test_a_block_that_turns_frees_all_but_where_it_stands(given):
     np.testing.assert_allclose(turned_variance(given, 0.04), 4 * turned_variance(given, 0.02))
 
 
-@double_precision
 def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_no_weight(given):
     a, (column,) = given.frame.arrays, _inertial(given)
     there, free = given.there, a.phase[..., Phase.FREE] > 0
@@ -187,12 +173,10 @@ def _moved(world, by):
 
 
 def test_a_block_that_a_moving_hand_takes_along_stays_there(given):
-    """A step of the hand while it holds a block on the ground is no gap where the hand is seen to move."""
     world, arrays, step = given.frame.world, given.frame.arrays, 4e-4
     x, stands = CHANNELS.index("x"), arrays.phase[0, :, Phase.PICKUP] * arrays.there[0, :, 0] > 0
     mine = np.flatnonzero(stands)[: np.flatnonzero(np.diff(np.flatnonzero(stands)) > 1)[0] + 1]
-    at = mine[mine.size // 2]
-    by = np.zeros(world.t.shape)
+    at, by = mine[mine.size // 2], np.zeros(world.t.shape)
     by[0, at:] = step
     left = {}
     for seen in (0.0, step):
@@ -211,22 +195,11 @@ def test_a_block_that_stood_on_a_slope_turns_back_as_it_is_lifted(given):
     world, arrays = given.frame.world, given.frame.arrays
     tilted = catalogue()["table_tilt"].correct(world, {"angle": 0.02, "turned": 0.8}, 1.0)
     offset, width = CHANNELS.index("offset"), arrays.onehot @ (arrays.objects @ given.centre[:, 1])
-    change = [
-        residuals(w, arrays, given.centre, np.zeros(2), given.noise)[0][..., offset] for w in (world, tilted)
-    ]
+    change = [residuals(w, arrays, given.centre, np.zeros(2), given.noise)[0][..., offset]
+              for w in (world, tilted)]  # fmt: skip
     change = (change[1] - change[0])[0] * (arrays.there[0, :, offset] > 0)
     held, move = arrays.onehot[0, :, 0] > 0, width[0][arrays.onehot[0, :, 0] > 0][0]
     there = held & (arrays.there[0, :, offset] > 0)
     # Predictions from the samples before miss it once, at the first that is in the air.
     first = np.flatnonzero(there & (arrays.phase[0, :, Phase.CARRY] > 0))[0]
-    assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05)
-    assert np.abs(change[:first]).max() < 1e-9
-
-
-def test_a_finger_that_still_presses_harder_is_no_gap_and_forces_in_balance_may_be_one():
-    t = np.arange(10) / 20.0
-    force = np.zeros((10, 4))
-    force[0] = -0.065, 0.02, -0.30, -0.41  # the right finger leaves last, while the left one rings
-    force[1] = 0.3, 0.2, -0.3, 0.2  # late forces of both
-    found = _one_finger(t, force, np.zeros(10, int), np.ones(10, bool), np.array([0.0]), np.full(10, 0.01))
-    np.testing.assert_array_equal(np.flatnonzero(found), [0])
+    assert change[first] == pytest.approx(0.02 * 0.8 * move, rel=0.05) and np.abs(change[:first]).max() < 1e-9

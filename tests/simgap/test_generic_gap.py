@@ -1,15 +1,20 @@
-"""The generic diagnosis: features with known values, planted effects named, alike ensembles called alike."""
+"""The generic diagnosis: features, planted effects, alike ensembles; `hmmseg diagnose --against`."""
 
+import json
+import re
 from itertools import pairwise
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from experiments.generic_ensembles import PLANTED, TASK, Scatter, ensemble
 from experiments.generic_ensembles import made as case_of
 from hmmseg.errors import InputError
+from hmmseg.example import example_folder
 from hmmseg.io.task import SequenceTask
 from hmmseg.io.trial import Trial
+from hmmseg_cli.main import main
 from simgap.generic.diagnose import diagnose, gap_of, whitening
 from simgap.generic.effects import predicted, scene
 from simgap.generic.ring import Ring, fit_ring, from_swing
@@ -29,35 +34,24 @@ def alike():
     return layout(align(real, sim, TASK, boundaries=boundaries))
 
 
-def test_means_are_those_of_straight_lines():
-    t = np.array([0.0, 1.0, 3.0])
-    values = np.array([0.0, 2.0, 0.0])
+def test_features_have_known_values_and_each_belongs_to_one_channel_or_is_a_duration(alike):
+    t, values = np.array([0.0, 1.0, 3.0]), np.array([0.0, 2.0, 0.0])
     found = means(t, values, np.array([0.0, 0.5, 2.0, 3.0]))
     np.testing.assert_allclose(found, [0.5, (0.75 + 1.5) / 1.5, 0.5])
-
-
-def test_white_noise_has_its_variance_in_every_coefficient():
     power = (transformed(0.3 * np.random.default_rng(0).standard_normal((4000, 50))) ** 2).mean(0)
     np.testing.assert_allclose(power[2:], 0.09, rtol=0.12)
     assert power[:2] == pytest.approx(0.0, abs=2e-2)  # the straight line is out
+    found = np.concatenate([alike.of_channel(c) for c in (0, 1, -1)])
+    assert sorted(found) == list(range(alike.kind.size)) and np.isfinite(np.concatenate(both(alike))).all()
 
 
-def test_parts_cover_a_subtask_and_follow_its_event_in_seconds(alike):
+def test_parts_follow_their_event_and_whitened_rows_have_the_squares_that_are_stated(alike):
     edges, first = np.array([0.0, 1.0, 3.0, 5.0]), int(alike.bins[0])
     short, long = (bin_edges(alike, edges + np.array([0, 0, d, d])) for d in (0.0, 1.0))
     assert short.size == alike.bins.sum() + 1 and (np.diff(short) > 0).all()
     assert short[np.cumsum([0, *alike.bins])] == pytest.approx(edges)
     assert short[first + 6] == long[first + 6] == pytest.approx(1.0 + alike.event[1])
     assert alike.event[0] == 0 and alike.event[1] > 0.2
-
-
-def test_every_feature_belongs_to_one_channel_or_is_a_duration(alike):
-    found = np.concatenate([alike.of_channel(c) for c in (0, 1, -1)])
-    assert sorted(found) == list(range(alike.kind.size))
-    assert np.isfinite(np.concatenate(both(alike))).all()
-
-
-def test_whitened_rows_of_alike_trials_have_the_squares_that_are_stated():
     squares, stated = [], []
     for seed in range(8):
         lay = layout(align(*made(seed)[:2], TASK, boundaries=made(seed)[2]))
@@ -72,14 +66,12 @@ def test_whitened_rows_of_alike_trials_have_the_squares_that_are_stated():
 def test_sub_bands_cover_the_spectrum_without_gaps(window):
     found = _sub_bands(6, window)
     assert found[0].start == 6 and found[-1].stop == window
-    assert all(a.stop == b.start for a, b in pairwise(found))
-    assert min(s.stop - s.start for s in found) >= 3
+    assert all(a.stop == b.start for a, b in pairwise(found)) and min(s.stop - s.start for s in found) >= 3
     assert _sub_bands(6, 8) == ()
 
 
 @pytest.mark.parametrize(("name", "shift"), [("bias", 0.3), ("gain", 0.2), ("rate", 0.1)])
 def test_predicted_shifts_are_those_of_changed_simulated_trials(name, shift):
-    """Against features of simulated trials that were changed sample by sample."""
     real, sim, boundaries = made(count=4)
 
     def changed(trial: Trial) -> Trial:
@@ -97,7 +89,7 @@ def test_predicted_shifts_are_those_of_changed_simulated_trials(name, shift):
     np.testing.assert_allclose(guess[: slow.size], truth, atol=tolerance)
 
 
-def test_lag_and_filter_reach_the_spectrum(alike):
+def test_lags_and_filters_reach_the_spectrum_but_not_the_noise_that_comes_after_them(alike):
     given = scene(alike)
     fast = slice(int((alike.kind[alike.channel == 0] == SLOW).sum()), None)
     plain = predicted(given, 0, {})[fast]
@@ -107,42 +99,44 @@ def test_lag_and_filter_reach_the_spectrum(alike):
     ]  # above what contacts hold
     np.testing.assert_allclose(loud, np.log(0.04 + 0.0004), atol=0.1)
     assert np.abs(predicted(given, 0, {"force_lag": {"delay": 0.08}})[fast] - plain).max() > 0.2
-
-
-def test_a_gain_and_a_filter_leave_the_noise_that_comes_after_them(alike):
-    given = scene(alike)
-    fast = slice(int((alike.kind[alike.channel == 0] == SLOW).sum()), None)
     plain = predicted(given, 0, {})[fast].reshape(3, 8)[:, -1]  # nothing but noise in the highest band
     # Were it read through them, too, its log power would be off by 0.8 and by -7.
     for effect in ({"force_gain": {"gain": 0.5}}, {"force_lowpass": {"time_constant": 0.05}}):
         np.testing.assert_allclose(predicted(given, 0, effect)[fast].reshape(3, 8)[:, -1], plain, atol=0.2)
 
 
-def test_a_ring_is_recovered_with_its_interval():
+def test_rings_begin_at_their_event_and_are_recovered_with_their_interval():
     rng, t, rings = np.random.default_rng(3), np.arange(400) / 200, []
     for _ in range(7):
         phase, size = rng.uniform(0, 6), rng.uniform(0.5, 1.0)
         wave = size * np.exp(-0.06 * 2 * np.pi * 7.4 * t) * np.sin(2 * np.pi * 7.4 * t + phase)
         rings.append(wave + 0.3 * t - 0.1 * t**2 + 0.02 * rng.standard_normal(t.size))
     found = fit_ring(from_swing(rings), 200.0)
-    assert found is not None
     assert found.frequency_90[0] < 7.4 < found.frequency_90[1]
     assert found.damping_90[0] < 0.06 < found.damping_90[1]
     assert found.frequency_90[1] - found.frequency_90[0] < 0.1
     assert fit_ring(np.tile(np.exp(-3 * t), (4, 1)), 200.0) is None  # a course is no ring
+    waves = Ring(5.0, 0.1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0)).waves(np.array([-0.1, 0.0, 0.05]))
+    np.testing.assert_allclose(waves[:, 0], 0.0)
+    np.testing.assert_allclose(waves[:, 1], [0.0, 1.0])
+    assert waves[0, 2] == pytest.approx(np.exp(-0.1 * 2 * np.pi * 5 * 0.05))
 
 
-def test_alike_ensembles_are_called_alike():
+def test_effects_can_be_forced_and_alike_ensembles_are_called_alike():
     found = [diagnose(align(*made(seed)[:2], TASK, boundaries=made(seed)[2])).body for seed in range(8)]
     assert sum(body["verdict"] != "none" for body in found) <= 1
+    real, sim, boundaries = made(2, count=4)
+    found = diagnose(align(real, sim, TASK, boundaries=boundaries), forced=["force_bias"])
+    assert found.body["causes"] == ["force_bias"]
+    with pytest.raises(InputError, match="needs the virtual model or is unknown"):
+        diagnose(align(real, sim, TASK, boundaries=boundaries), forced=["grip_slip"])
 
 
 @pytest.mark.parametrize("name", list(PLANTED))
 def test_a_planted_effect_is_named_with_its_parameters(name):
     real, sim, boundaries = made(5, {name: PLANTED[name]})
     body = diagnose(align(real, sim, TASK, boundaries=boundaries)).body
-    assert body["verdict"] in ("named", "set")
-    assert name in {*body["causes"], *body["indistinguishable"]}
+    assert body["verdict"] in ("named", "set") and name in {*body["causes"], *body["indistinguishable"]}
     assert sum(body["probabilities"].values()) == pytest.approx(1.0)
     best = body["effects"]["+".join(body["causes"])]["parameters"]
     prefix = f"{name}." if len(body["causes"]) > 1 else ""
@@ -153,8 +147,7 @@ def test_a_planted_effect_is_named_with_its_parameters(name):
         p = best[prefix + key]
         low, high = p["interval_90"]
         wide = 2 * (high - low)
-        assert low - wide < true < high + wide
-        assert p["mean"] == pytest.approx(true, rel=0.25)
+        assert low - wide < true < high + wide and p["mean"] == pytest.approx(true, rel=0.25)
     assert body["shrinkage"]["fraction"] > 0.5
     assert {row["channel"] for row in body["where"]} <= {"fa", "fb", "duration"}
     assert sum(row["share"] for row in body["where"]) == pytest.approx(1.0)
@@ -162,27 +155,14 @@ def test_a_planted_effect_is_named_with_its_parameters(name):
 
 @pytest.mark.parametrize("pair", [("force_gain", "force_lag"), ("force_bias", "force_gain")])
 def test_two_planted_effects_are_both_named(pair):
-    """What a gain does to noise, and a lag by parts of a sample, must not stand in for one of them."""
     ensembles = case_of(101, {name: PLANTED[name] for name in pair}, False)
     assert diagnose(ensembles).body["causes"] == list(pair)
 
 
-def test_an_effect_can_be_forced_and_an_unknown_one_is_refused():
-    real, sim, boundaries = made(2, count=4)
-    found = diagnose(align(real, sim, TASK, boundaries=boundaries), forced=["force_bias"])
-    assert found.body["causes"] == ["force_bias"]
-    with pytest.raises(InputError, match="needs the virtual model or is unknown"):
-        diagnose(align(real, sim, TASK, boundaries=boundaries), forced=["grip_slip"])
-
-
-def test_one_real_trial_says_that_it_is_weaker():
+def test_one_trial_is_weaker_and_trials_that_do_not_go_together_are_refused():
     real, sim, boundaries = made(4, {"force_bias": {"value": 1.0}})
     found = diagnose(align(real[:1], sim, TASK, boundaries=boundaries))
-    assert any("nothing is held out" in w for w in found.warnings)
-    assert "force_bias" in found.leading
-
-
-def test_trials_that_do_not_go_together_are_refused():
+    assert any("nothing is held out" in w for w in found.warnings) and "force_bias" in found.leading
     real, sim, boundaries = made(4)
     with pytest.raises(InputError, match="one real and one simulated"):
         align(real[:1], sim[:1], TASK, boundaries=boundaries)
@@ -192,7 +172,7 @@ def test_trials_that_do_not_go_together_are_refused():
         align(real, sim, SequenceTask(TASK.sequence, ("fa", "fc")))
 
 
-def test_missing_samples_are_bridged(alike):
+def test_missing_samples_are_bridged_and_rates_may_differ(alike):
     real, sim, boundaries = made()
     holed = real[0].channels["fa"].copy()
     holed[50:60] = np.nan
@@ -201,25 +181,13 @@ def test_missing_samples_are_bridged(alike):
     assert np.isfinite(found).all()
     changed = ~np.isclose(found[0], both(alike)[0][0])
     assert 0 < changed.sum() < found.shape[1] / 3
-
-
-def test_rates_may_differ():
-    """Simulated at ten times the rate: compared at the real one's."""
     rng = np.random.default_rng(6)
     real, first = ensemble(rng, 5)
     sim, second = ensemble(rng, 5, None, Scatter(rate=1000.0, noise=0.02 * np.sqrt(10)), "sim")
     lay = layout(align(real, sim, TASK, boundaries=first | second))
     assert lay.rate == pytest.approx(100, rel=1e-3)
-    found = both(lay)
-    top = lay.kind == FAST
+    found, top = both(lay), lay.kind == FAST
     assert np.abs(found[0].mean(0) - found[1].mean(0))[top].mean() < 0.6  # averaged, not picked
-
-
-def test_rings_begin_at_their_event():
-    waves = Ring(5.0, 0.1, 0.0, 0.0, (0.0, 0.0), (0.0, 0.0)).waves(np.array([-0.1, 0.0, 0.05]))
-    np.testing.assert_allclose(waves[:, 0], 0.0)
-    np.testing.assert_allclose(waves[:, 1], [0.0, 1.0])
-    assert waves[0, 2] == pytest.approx(np.exp(-0.1 * 2 * np.pi * 5 * 0.05))
 
 
 @pytest.mark.slow
@@ -228,5 +196,102 @@ def test_the_hmm_finds_the_subtasks_by_itself():
     given = align(real, sim, TASK)
     # Without labels a boundary may settle anywhere in the course, but in all trials of both kinds alike.
     late = [cut.edges[1] - boundaries[cut.trial.file][0] for cut in (*given.real, *given.sim)]
-    assert np.std(late) < 0.1
-    assert "force_bias" in diagnose(given).body["causes"]
+    assert np.std(late) < 0.1 and "force_bias" in diagnose(given).body["causes"]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A plain ordered task with real trials that carry a large bias, and simulated ones."""
+    rng = np.random.default_rng(7)
+    for name, effects in (("real", {"force_bias": {"value": 1.0}}), ("sim", None)):
+        trials, _ = ensemble(rng, 5, effects, name=name)
+        for trial in trials:
+            pd.DataFrame({"t": trial.t, **trial.channels}).to_csv(tmp_path / trial.file, index=False)
+    (tmp_path / "task.toml").write_text('sequence = ["approach", "press", "hold"]\n')
+    return tmp_path
+
+
+def arguments(folder, *more, count=5):
+    trials = {kind: [str(folder / f"{kind}_{k:02d}.csv") for k in range(count)] for kind in ("real", "sim")}
+    task = ["--task", str(folder / "task.toml")]
+    return ["diagnose", *trials["real"], *task, "--against", *trials["sim"], *more]
+
+
+def test_values_of_against_reach_up_to_the_next_option(folder, monkeypatch):
+    taken = {}
+
+    def against(out, paths, sims, *rest):
+        taken["real"], taken["sim"] = [p.name for p in paths], [p.name for p in sims]
+
+    monkeypatch.setattr("hmmseg_cli.diagnose._against", against)
+    given = arguments(folder, "--seed", "1")
+    assert main(given) == 0
+    once = taken | {}
+    again = [a for n in given[given.index("--against") + 1 : -2] for a in ("--against", n)]
+    assert main([*given[: given.index("--against")], *again]) == 0
+    assert once == taken and len(once["sim"]) == len(once["real"]) == 5
+
+
+def test_columns_of_a_plain_task_are_those_that_the_rig_maps(folder, tmp_path):
+    for path in [*folder.glob("real_*.csv"), *folder.glob("sim_*.csv")]:
+        pd.read_csv(path).rename(columns={"t": "stamp"}).to_csv(path, index=False)
+    (folder / "columns.toml").write_text('[columns]\nt = {from = "stamp"}\n')
+    out = tmp_path / "out.json"
+    args = arguments(folder, "--rig", str(folder / "columns.toml"), "--json", str(out), "--quiet")
+    assert main(args) == 0 and json.loads(out.read_text())["causes"] == ["force_bias"]
+
+
+def test_plain_tasks_need_simulated_trials_and_settled_boundaries(folder, tmp_path, capsys):
+    (folder / "task.toml").write_text('sequence = ["approach", "press"]\n')  # one of two changes
+    out = tmp_path / "out.json"
+    assert main(arguments(folder, "--json", str(out), "--quiet")) == 0
+    assert any("as well be elsewhere" in line for line in json.loads(out.read_text())["warnings"])
+    args = arguments(folder)
+    assert main(args[: args.index("--against")]) == 2
+    line = capsys.readouterr().err
+    assert "--against SIM" in line and line.count("\n") == 1
+
+
+@pytest.mark.parametrize(("more", "line"), [
+    (["--actual", "actual.toml"], "does not go with --against"),
+    (["--healthy", "sim_04.csv"], "does not go with --against"),
+    (["--effect", "grip_slip"], "needs the virtual model"),
+    (["--against", "real_00.csv"], "the same trial as")])  # fmt: skip
+def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypatch, more, line):
+    monkeypatch.chdir(folder)
+    (folder / "actual.toml").write_text("")
+    assert main(arguments(folder, *more)) == 2 and line in capsys.readouterr().err
+
+
+def test_trials_as_simulate_writes_them_go_with_recordings_of_other_columns(tmp_path, monkeypatch):
+    example, read = example_folder(), []
+    clock = '\n[columns]\nt = {from = "stamp", unit = "ms"}\n'
+    (tmp_path / "rig.toml").write_text((example / "rig.toml").read_text() + clock)
+    table = pd.read_csv(example / "trial_01.csv").rename(columns={"t": "stamp"})
+    table.assign(stamp=1000 * table.stamp).to_csv(tmp_path / "real.csv", index=False)
+
+    def stop(real, simulated, *_):
+        read.extend([*real, *simulated])
+        raise InputError("test", "has seen enough")
+
+    monkeypatch.setattr("simgap.generic.trials.align_block_trials", stop)
+    args = ["--task", str(example / "task.toml"), "--rig", str(tmp_path / "rig.toml"), "--against"]
+    assert main(["diagnose", str(tmp_path / "real.csv"), *args, str(example / "trial_01.csv")]) == 2
+    real, simulated = read
+    np.testing.assert_allclose(real.t, simulated.t, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_bias_is_named_with_figures_and_page(folder):
+    outputs = ["--json", f"{folder}/d.json", "--figures", f"{folder}/f", "--report", f"{folder}/p.html"]
+    assert main(arguments(folder, *outputs, "--quiet")) == 0
+    document = json.loads((folder / "d.json").read_text())
+    assert document["format"] == "hmmseg.diagnose/1"
+    assert (document["verdict"], document["causes"]) == ("named", ["force_bias"])
+    assert document["effects"]["force_bias"]["parameters"]["fa"]["mean"] == pytest.approx(1.0, abs=0.1)
+    assert document["effects"]["force_bias"]["parameters"]["fa"]["unit"] == "unit of fa"
+    assert {row["channel"] for row in document["where"]} == {"fa"} and document["shrinkage"]["fraction"] > 0.9
+    assert all((folder / "f" / f"gap_{n}.png").stat().st_size > 5000
+               for n in ("where", "signal", "before_after"))  # fmt: skip
+    page = (folder / "p.html").read_text()
+    assert 'id="verdict"' in page and "force_bias" in page and not re.search(r"(src|href)=\"(?!data:)", page)

@@ -21,7 +21,6 @@ LAWFUL = f"""<mujoco><option timestep="0.0005" integrator="implicitfast" gravity
 
 
 def swung(gravity=True, angle=0.0, rate=0.0, torque=0.0, seconds=0.2, **laws):
-    """Angles and rates (steps,) of a pendulum with these laws, and its steps' times."""
     model = mujoco.MjModel.from_xml_string(LAWFUL)
     if not gravity:
         model.opt.gravity[:] = 0.0
@@ -52,19 +51,18 @@ def test_friction_by_load_holds_at_rest_up_to_its_limit():
     assert rate[-1] / t[-1] == pytest.approx((1.0 - 0.5 * 0.5 * 3) * weight / INERTIA, rel=0.03)
 
 
-def test_friction_by_direction_and_near_standstill_brakes_as_stated():
+def test_laws_brake_as_stated_and_those_that_do_nothing_run_as_the_plain_model():
     for way, torque in ((1.0, 0.05), (-1.0, 0.0)):  # 0.05 N m one way, and as nothing holds it back, none
         _, rate, t = swung(gravity=False, rate=way, direction_friction=0.05)
         assert rate[-1] == pytest.approx(way * (1 - torque / INERTIA * t[-1]), rel=0.01)
     _, rate, t = swung(gravity=False, rate=0.5, stribeck_extra=0.02, stribeck_speed=0.4, seconds=0.05)
     assert rate[-1] == pytest.approx(0.5 - 0.02 * np.exp(-((0.5 / 0.4) ** 2)) / INERTIA * t[-1], rel=0.01)
-
-
-def test_drag_and_a_drive_that_fades():
     _, rate, t = swung(gravity=False, rate=5.0, quadratic_drag=0.01)
     np.testing.assert_allclose(rate, 5 / (1 + 0.01 * 5 / INERTIA * t), rtol=1e-3)
     _, rate, t = swung(gravity=False, torque=1.0, fade=0.3, seconds=0.05)  # half of the most: 15 % less
     assert rate[-1] / t[-1] == pytest.approx(0.85 / INERTIA, rel=1e-3)
+    plain, acting = (swung(angle=1.0, torque=0.1, **laws)[0] for laws in ({}, {"load_friction": 1e-12}))
+    np.testing.assert_allclose(acting, plain, atol=1e-12)
 
 
 def test_cogging_and_ripple_come_and_go_with_the_angle():
@@ -88,8 +86,3 @@ def test_how_often_a_torque_comes_and_goes_is_read_off_the_logs(scaled):
     even = replace(motion, torque={0: motor + 0.004 * rng.standard_normal(t.size)})
     exact = replace(motion, torque={0: motor})
     assert not any(periods([one], 0, scaled) for one in (still, even, exact))
-
-
-def test_laws_that_do_nothing_run_as_the_plain_model():
-    plain, acting = (swung(angle=1.0, torque=0.1, **laws)[0] for laws in ({}, {"load_friction": 1e-12}))
-    np.testing.assert_allclose(acting, plain, atol=1e-12)

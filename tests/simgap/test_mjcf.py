@@ -4,6 +4,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from hmmseg.errors import InputError
 from simgap.simulators.protocol import Job
@@ -41,6 +42,51 @@ noise = 1e-4
 actuator = "m"
 unit = "Nm"
 """
+TURN = '[columns.q]\njoint = "turn"\nnoise = 1e-4\n[columns.u]\nactuator = "servo"\nunit = "rad"\n'
+SET = ("joint:turn.damping", "joint:turn.armature", "body:arm.mass", "body:arm.com_x", "body:arm.payload",
+       "actuator:servo.gain", "actuator:servo.damping", "option.tilt_x", "option.timestep",
+       "joint:nod.tie")  # fmt: skip
+TIE = """<body name="head" pos="1 0 0"><joint name="nod" axis="0 0 1"/><geom size="0.02" mass="0.1"/></body>
+  </worldbody><equality><joint joint1="nod" joint2="turn"/></equality>"""
+SERVO = """<mujoco>
+  <option timestep="0.001" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody><body name="arm"><joint name="turn" axis="0 0 1" armature="0.02" damping="0.1"/>
+    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.8" contype="0" conaffinity="0"/>
+    <site name="tool" pos="0.2 0 0"/>%s</body></worldbody>
+  <actuator><position name="servo" joint="turn" kp="40" kv="2"/></actuator>
+</mujoco>
+"""
+FINGERS = """<mujoco>
+  <worldbody>
+    <body><joint name="left" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/></body>
+    <body pos="0.1 0 0"><joint name="right" type="slide" axis="-1 0 0"/><geom size="0.01" mass="0.1"/></body>
+    <body pos="0.2 0 0"><joint name="tip"/><geom size="0.01" mass="0.1"/></body>
+  </worldbody>
+  <equality>
+    <joint joint1="right" joint2="left" polycoef="0.01 2 0 0 0"/>
+    <joint joint1="tip" joint2="right" polycoef="0 0 3 0 0"/>
+  </equality>
+</mujoco>
+"""
+TIED = """<mujoco>
+  <option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/>
+  <worldbody>
+    <body><joint name="left" type="slide" axis="1 0 0" armature="0.1"/>
+      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
+    <body pos="1 0 0"><joint name="right" type="slide" damping="20" axis="1 0 0"/>
+      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
+  </worldbody>
+  <equality><joint joint1="right" joint2="left"/></equality>
+  <actuator><position name="servo" joint="left" kp="200" kv="10"/></actuator>
+</mujoco>
+"""
+URDF = """<robot name="swing">
+  <link name="base"/>
+  <link name="bob"><inertial><origin xyz="0 0 -0.2"/><mass value="0.5"/>
+    <inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial></link>
+  <joint name="pivot" type="continuous"><parent link="base"/><child link="bob"/><axis xyz="0 1 0"/></joint>
+</robot>
+"""
 
 
 @pytest.fixture
@@ -54,14 +100,12 @@ def files(tmp_path):
 
 
 def loaded(files, *candidates: str):
-    found = load_mjcf(*files(), candidates)
-    t = np.arange(0, 2, 0.01)
+    found, t = load_mjcf(*files(), candidates), np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.1 * np.cos(6.9 * t), "u": np.zeros(t.size)})
     return found, log, found.effects([log])
 
 
 def read_back(found, folder, angle, command):
-    """The log of an angle and a command at 100 Hz, as the model's map reads its file."""
     rows = np.column_stack([np.arange(0, 2, 0.01), angle, command])
     np.savetxt(folder / "log.csv", rows, "%.6f", ",", header="t,q,u", comments="")
     return found.read(folder / "log.csv")
@@ -69,8 +113,7 @@ def read_back(found, folder, angle, command):
 
 @pytest.mark.parametrize("share", [0.0, 0.6])
 def test_a_window_is_the_linear_pendulum(files, share):
-    """Small swings at omega^2 = m g l / (m l^2 + I) between samples of the grid, of the weight
-    that no drive carries."""
+    """Small swings at omega^2 = m g l / (m l^2 + I), of the weight that no drive carries."""
     found, log, _ = loaded(files)
     simulator = found.simulator
     nominal = {n: p.nominal for n, p in simulator.parameters.items()}
@@ -79,13 +122,11 @@ def test_a_window_is_the_linear_pendulum(files, share):
     simulator.simulate(heavy, log, {"q": 0.1, "q_rate": 0.0})  # leaves no trace
     nominal["drive.gravity_compensation"] = share
     (channels,) = simulator.simulate_many([Job(nominal, window, {"q": 1e-3, "q_rate": -2e-3})])
-    assert channels is not None
     inertia = 0.5 * 0.2**2 + 0.4 * 0.5 * 0.01**2
     omega = np.sqrt((1 - share) * 0.5 * 9.81 * 0.2 / inertia)
     t = window.t - window.t[0]
-    np.testing.assert_allclose(
-        channels["q"], 1e-3 * np.cos(omega * t) - 2e-3 / omega * np.sin(omega * t), atol=2e-8
-    )
+    np.testing.assert_allclose(channels["q"], 1e-3 * np.cos(omega * t) - 2e-3 / omega * np.sin(omega * t),
+                               atol=2e-8)  # fmt: skip
 
 
 def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
@@ -115,43 +156,49 @@ def test_steps_and_lines_between_samples_are_held_as_the_steps_have_them():
         ("window = 1e9", "window.*equal to 1000000"), ('window = "long"', "window"),
         ("window = nan", "window"), ("time = 3", "time"), ("time = []", "time"),
         ('time = {column = "t", unit = "parsec"}', "unit"), ("keyframe = 3", "keyframe.*valid string"),
-        ('keyframe = "home"', "no keyframe home; expected no name"), ("windw = 1", "windw"),
-    ]),
-])  # fmt: skip
+        ('keyframe = "home"', "no keyframe home; expected no name"), ("windw = 1", "windw")])])  # fmt: skip
 def test_a_map_at_fault_is_said_in_a_line(files, described, line):
-    with pytest.raises(InputError, match=line):
-        load_mjcf(*files(described=described))
+    refused(line, load_mjcf, *files(described=described))
 
 
 @pytest.mark.parametrize("step", ["0", "-0.001", "1e-12", "nan", "5"])
 def test_a_model_whose_time_step_is_none(files, step):
-    with pytest.raises(InputError, match=r"swing\.xml"):
-        load_mjcf(*files(XML.replace('"0.001"', f'"{step}"')))
+    refused(r"swing\.xml", load_mjcf, *files(XML.replace('"0.001"', f'"{step}"')))
 
 
 @pytest.mark.parametrize(("xml", "line"), [
     (XML.replace('axis="0 1 0" range="-3 3"', 'type="ball"').replace("motor name", 'motor gear="1 0 0" name'),
      "columns.q.joint: pivot is no hinge or slide; expected the seven columns"),
-    (XML.replace("</worldbody>", ""), "does not read it: .*line number=.*worldbody"),
-])  # fmt: skip
+    (XML.replace("</worldbody>", ""), "does not read it: .*line number=.*worldbody")])  # fmt: skip
 def test_a_model_at_fault_is_said_in_a_line(files, xml, line):
-    with pytest.raises(InputError, match=f"(?i){line}"):
-        load_mjcf(*files(xml))
+    refused(f"(?i){line}", load_mjcf, *files(xml))
 
 
-def test_a_candidate_that_is_none_is_said(files):
-    with pytest.raises(InputError, match="no joint elbow"):
-        loaded(files, "joint:elbow.damping")
-    with pytest.raises(InputError, match="has no dampin that can be"):
-        loaded(files, "joint:pivot.dampin")
+def test_loads_are_carried_by_the_tool_of_the_last_link_or_where_they_are_said_to_be(files):
+    refused("no joint elbow", loaded, files, "joint:elbow.damping")
+    refused("has no dampin that can be", loaded, files, "joint:pivot.dampin")
+    with pytest.raises(InputError, match=r"payload_at.arm: the model has no site tol.*tool"):
+        load_mjcf(*files(SERVO % "", 'payload_at = {arm = "tol"}\n' + TURN))
+    with pytest.raises(InputError, match=r"payload_at.arm: .*name of a site"):
+        load_mjcf(*files(SERVO % "", "payload_at = {arm = 3}\n" + TURN))
+    tool = '<body name="hand" pos="0.3 0 0"><geom size="0.01" mass="0.2" contype="0" conaffinity="0"/></body>'
+    offered = turning(files, TURN, tool)[0].simulator.parameters
+    assert {"body:arm.mass", "body:hand.mass", "body:hand.com_x", "body:hand.payload"} <= {*offered}
+    assert "body:arm.payload" not in offered
+    stated = turning(files, 'payload_at = {arm = "tool"}\n' + TURN, tool)[0].simulator.parameters
+    assert "body:arm.payload" in stated and "body:hand.payload" not in stated
 
 
-def test_degrees_where_radians_are_declared_are_named(files, tmp_path):
+def test_degrees_of_angles_and_of_rates_are_named(files, tmp_path):
     found, log, _ = loaded(files)
-    with pytest.raises(
-        InputError, match=r"column q: .* rad, beyond joint pivot's -3 to 3; expected unit = .deg"
-    ):
-        read_back(found, tmp_path, np.degrees(20 * log["q"]), 0 * log.t)
+    refused(r"column q: .* rad, beyond joint pivot's -3 to 3; expected unit = .deg", read_back, found,
+            tmp_path, np.degrees(20 * log["q"]), 0 * log.t)  # fmt: skip
+    servo = XML.replace('<motor name="m" joint="pivot"/>', '<velocity name="m" joint="pivot" kv="9"/>')
+    found = load_mjcf(*files(servo, MAP.replace('unit = "Nm"', 'unit = "rad/s"')))
+    t = np.arange(0, 2, 0.01)
+    assert not read_back(found, tmp_path, np.sin(t), np.cos(t)).warnings
+    with pytest.raises(InputError, match=r"column u: .* rad/s of column q; expected unit = .deg/s. of u"):
+        read_back(found, tmp_path, np.sin(t), np.degrees(np.cos(t)))
 
 
 @pytest.mark.parametrize("unit", ["", 'unit = "rad"\n'])
@@ -163,8 +210,7 @@ def test_a_wheel_turns_as_often_as_it_does_if_its_unit_is_stated(files, tmp_path
     if unit:
         assert found.read(tmp_path / "a.csv")["q"][-1] == pytest.approx(59.88)
     else:
-        with pytest.raises(InputError, match=r"expected unit = .deg. in the map"):
-            found.read(tmp_path / "a.csv")
+        refused(r"expected unit = .deg. in the map", found.read, tmp_path / "a.csv")
 
 
 def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, tmp_path):
@@ -198,8 +244,7 @@ def test_what_a_slide_s_actuator_gives_is_a_force(files, kind, units):
     xml = XML.replace('<motor name="m" joint="pivot"/>', servo).replace('axis="0 1 0"', f'type="{kind}"')
     model = load_mjcf(*files(xml, f'{MAP}[columns.f]\nactuator = "m"\nkind = "force"')).simulator
     found = [model.channels["f"].unit, setting_of(model.model, "actuator:m.limit").unit]
-    assert found == units
-    assert setting_of(model.model, "actuator:m.damping").unit.startswith(f"{units[0]} s")
+    assert found == units and setting_of(model.model, "actuator:m.damping").unit.startswith(f"{units[0]} s")
 
 
 @pytest.mark.parametrize(("unit", "si"), [("deg", "rad"), ("mNm", "Nm"), ("%", "1"), ("V", "1")])
@@ -209,15 +254,6 @@ def test_a_command_has_the_unit_of_its_values(files, unit, si):
     assert found.simulator.channels["u"].unit == si
 
 
-def test_goals_of_rates_in_degrees_are_told(files, tmp_path):
-    servo = XML.replace('<motor name="m" joint="pivot"/>', '<velocity name="m" joint="pivot" kv="9"/>')
-    found = load_mjcf(*files(servo, MAP.replace('unit = "Nm"', 'unit = "rad/s"')))
-    t = np.arange(0, 2, 0.01)
-    assert not read_back(found, tmp_path, np.sin(t), np.cos(t)).warnings
-    with pytest.raises(InputError, match=r"column u: .* rad/s of column q; expected unit = .deg/s. of u"):
-        read_back(found, tmp_path, np.sin(t), np.degrees(np.cos(t)))
-
-
 def test_delayed_commands_step_when_they_are_carried_out(files):
     """The mean over each solver's step of what was commanded 12.3 ms before, by brute force."""
     found, log, effects = loaded(files)
@@ -225,7 +261,6 @@ def test_delayed_commands_step_when_they_are_carried_out(files):
     t = log.t + 1e-3 * rng.uniform(-1, 1, log.t.size)
     log = Recording("a.csv", t, {"q": log["q"], "u": rng.normal(size=t.size)})
     late = effects_of(found.simulator, [log], effects)["command.delay"].command
-    assert late is not None
     window = late(log, {"delay": 0.0123}).window(40, 80)
     times = np.arange(0, float(window.t[-1] - window.t[0]), 1e-3)
     since = np.array([window.t - window.t[0]])
@@ -239,27 +274,22 @@ def test_delayed_commands_step_when_they_are_carried_out(files):
     np.testing.assert_allclose(line, asked, atol=0.02)
 
 
-def test_a_mass_stays_within_what_a_robot_can_have(files):
+def test_masses_stay_within_what_a_robot_can_have_and_numerics_are_no_candidates(files):
     found, log, effects = loaded(files)
     mass = effects_of(found.simulator, [log], effects)["body:bob.mass"].parameters["mass"]
     assert (mass.low, mass.high) == pytest.approx((0.5 / 3, 1.5))
-
-
-def test_how_commands_are_held_and_the_step_are_numerics_and_no_candidates(files):
     found, log, _ = loaded(files)
     made = candidates(Setting(found.simulator, [log]))
     assert {n for n, e in made.items() if e.fitted} == found.simulator.numerics
     known = "timestep", "integrator", "iterations", "hold", "smooth", "late"
     assert found.simulator.numerics == {f"option.{n}" for n in known}
-    with pytest.raises(InputError, match="option has no integratr"):
-        loaded(files, "option.integratr")
+    refused("option has no integratr", loaded, files, "option.integratr")
 
 
 @pytest.mark.parametrize(
     ("own", "name", "other"),
     [("RK4", "timestep", "Euler"), ("RK4", "integrator", "implicit"), ("Euler", "integrator", "implicit"),
-     ("implicit", "integrator", "Euler")],
-)  # fmt: skip
+     ("implicit", "integrator", "Euler")])  # fmt: skip
 def test_another_integrator_errs_as_the_numerics_say(files, own, name, other):
     """Whole it is that integrator's run; a third of Euler's error is what it errs at a third of the step."""
 
@@ -276,29 +306,10 @@ def test_another_integrator_errs_as_the_numerics_say(files, own, name, other):
         assert np.abs(error).max() > 1e-4 and np.abs(left).max() < 0.05 * np.abs(error).max()
 
 
-SERVO = """<mujoco>
-  <option timestep="0.001" integrator="implicitfast" gravity="0 0 0"/>
-  <worldbody><body name="arm"><joint name="turn" axis="0 0 1" armature="0.02" damping="0.1"/>
-    <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.8" contype="0" conaffinity="0"/>
-    <site name="tool" pos="0.2 0 0"/>%s</body></worldbody>
-  <actuator><position name="servo" joint="turn" kp="40" kv="2"/></actuator>
-</mujoco>
-"""
-TURN = '[columns.q]\njoint = "turn"\nnoise = 1e-4\n[columns.u]\nactuator = "servo"\nunit = "rad"\n'
-
-
-SET = ("joint:turn.damping", "joint:turn.armature", "body:arm.mass", "body:arm.com_x", "body:arm.payload",
-       "actuator:servo.gain", "actuator:servo.damping", "option.tilt_x", "option.timestep",
-       "joint:nod.tie")  # fmt: skip
-TIE = """<body name="head" pos="1 0 0"><joint name="nod" axis="0 0 1"/><geom size="0.02" mass="0.1"/></body>
-  </worldbody><equality><joint joint1="nod" joint2="turn"/></equality>"""
-
-
 @pytest.mark.parametrize("name", SET)
 def test_a_patched_model_is_the_one_that_was_simulated(files, name):
     paths = files(SERVO.replace('gravity="0 0 0"', "").replace("</worldbody>", TIE) % "", TURN)
-    found = load_mjcf(*paths)
-    t = np.arange(0, 2, 0.01)
+    found, t = load_mjcf(*paths), np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.3 * np.sin(6 * t), "u": 0.3 * np.sin(6 * t)})
     effects, simulator = effects_of(found.simulator, [log], found.effects([log])), found.simulator
     composed = Composed.of(simulator, [log], effects, noises(simulator, [log]))
@@ -330,39 +341,25 @@ def turning(files, described: str = TURN, more: str = "", u: np.ndarray | None =
     return found, run
 
 
-@pytest.mark.parametrize(("kind", "number", "other"), [
-    ("muscle", 'lengthrange="-1 1" force="%s"', ""), ("damper", 'kv="%s" ctrlrange="0 1"', ""),
-    ("dcmotor", 'motorconst="%s" resistance="20"', "DCMOTOR"),
+@pytest.mark.parametrize(("kind", "number"), [
+    ("muscle", 'lengthrange="-1 1" force="%s"'), ("damper", 'kv="%s" ctrlrange="0 1"'),
+    ("dcmotor", 'motorconst="%s" resistance="20"'), ("position", 'kp="%s"'), ("velocity", 'kv="%s"'),
 ])  # fmt: skip
-def test_the_gain_of_any_actuator_is_its_strength(files, kind, number, other):
+def test_the_gain_of_any_actuator_is_its_strength_or_how_stiffly_it_follows(files, kind, number):
     """The first of a muscle's numbers is a length, of a motor's a resistance, and a damper's is zero."""
-    if other and not hasattr(mujoco.mjtGain, f"mjGAIN_{other}"):
+    if kind == "dcmotor" and not hasattr(mujoco.mjtGain, "mjGAIN_DCMOTOR"):
         pytest.skip("not in this MuJoCo")
     driven = XML.replace('<motor name="m" joint="pivot"/>', f'<{kind} name="m" joint="pivot" {number}/>')
+    unit = {"position": 'unit = "rad"', "velocity": 'unit = "rad/s"'}.get(kind, "")
     log = Recording("a.csv", np.arange(0, 0.5, 0.01), {"q": np.zeros(50), "u": np.full(50, 0.5)})
 
     def run(strength: float, **changed: float) -> np.ndarray:
-        found = load_mjcf(*files(driven % strength, MAP.replace('unit = "Nm"', "")))
+        found = load_mjcf(*files(driven % strength, MAP.replace('unit = "Nm"', unit)))
         found.effects([log])
         return found.simulator.simulate(changed, log, {"q": 0.5, "q_rate": 2.0})["q"]
 
     assert np.ptp(run(0.5) - run(0.4)) > 1e-3
     np.testing.assert_allclose(run(0.5, **{"actuator:m.gain": -0.2}), run(0.4), atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", ["position", "velocity"])
-def test_the_gain_of_a_servo_is_how_stiffly_it_follows(files, kind):
-    def run(stiff: float, **changed: float) -> np.ndarray:
-        number = {"position": "kp", "velocity": "kv"}[kind]
-        servo = SERVO.replace('<position name="servo" joint="turn" kp="40" kv="2"/>',
-                              f'<{kind} name="servo" joint="turn" {number}="{stiff}"/>')  # fmt: skip
-        found, _ = turning(lambda *given: files(servo % "", given[1]))
-        values = {n: s.nominal for n, s in found.simulator.settings.items()} | changed
-        log = Recording("a.csv", t, {"q": 0 * t, "u": 0.3 * np.sin(6 * t)})
-        return found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 1.8})["q"]
-
-    t = np.arange(0, 2, 0.01)
-    np.testing.assert_allclose(run(2.0, **{"actuator:servo.gain": -0.2}), run(1.6), atol=1e-9)
 
 
 def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
@@ -375,13 +372,12 @@ def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
         asked.append(float(data.qpos[0]))
         data.ctrl[:] = np.interp(k * h, t, 0.3 * np.sin(6 * t))
         mujoco.mj_step(model, data)
-    np.testing.assert_allclose(
-        run(option__hold=1.0), np.interp(t, h * np.arange(len(asked)), asked), atol=1e-5
-    )
+    np.testing.assert_allclose(run(option__hold=1.0), np.interp(t, h * np.arange(len(asked)), asked),
+                               atol=1e-5)  # fmt: skip
     assert np.abs(run(option__hold=1.0, option__late=0.5) - run(option__hold=1.0)).max() > 1e-4
 
 
-def test_smoothed_commands_are_means_with_their_neighbours(files):
+def test_smoothed_commands_are_means_and_play_lags_at_turns(files):
     u = np.random.default_rng(0).uniform(-0.3, 0.3, 200)
     mean = u.copy()
     mean[1:-1] = 0.7 * u[1:-1] + 0.15 * (u[2:] + u[:-2])
@@ -389,6 +385,12 @@ def test_smoothed_commands_are_means_with_their_neighbours(files):
     _, run = turning(files, u=u)
     np.testing.assert_allclose(run(option__smooth=0.3), plain(), atol=1e-12)
     assert np.abs(run() - plain()).max() > 1e-3
+    found, run = turning(files)
+    assert found.simulator.parameters["joint:turn.width"].effect == "command:u.backlash"
+    plain = run()
+    assert np.abs(run(joint_of_turn__width=1e-7) - plain).max() < 1e-3
+    apart = run(joint_of_turn__width=0.02) - plain
+    assert 3e-3 < np.abs(apart).max() < 0.06 and np.abs(run() - plain).max() == 0.0
 
 
 def test_commands_that_follow_a_curve_between_samples_are_in_reach(files):
@@ -409,45 +411,16 @@ def test_commands_that_follow_a_curve_between_samples_are_in_reach(files):
     np.testing.assert_array_equal(run(option__smooth=low), run())  # steps have none
 
 
-FINGERS = """<mujoco>
-  <worldbody>
-    <body><joint name="left" type="slide" axis="1 0 0"/><geom size="0.01" mass="0.1"/></body>
-    <body pos="0.1 0 0"><joint name="right" type="slide" axis="-1 0 0"/><geom size="0.01" mass="0.1"/></body>
-    <body pos="0.2 0 0"><joint name="tip"/><geom size="0.01" mass="0.1"/></body>
-  </worldbody>
-  <equality>
-    <joint joint1="right" joint2="left" polycoef="0.01 2 0 0 0"/>
-    <joint joint1="tip" joint2="right" polycoef="0 0 3 0 0"/>
-  </equality>
-</mujoco>
-"""
-
-
 @pytest.mark.parametrize("seen", ["left", "right"])
 def test_joints_without_a_column_follow_their_equality(files, seen):
     found = load_mjcf(*files(FINGERS, f'[columns.w]\njoint = "{seen}"\n'))
     t, (left, right) = np.arange(0, 1, 0.01), (0.02, 0.05)
     start = {"left": (left, 0.1), "right": (right, 0.2)}[seen]
-    job = Job(
-        {}, Recording("a.csv", t, {"w": np.zeros(t.size)}), dict(zip(("w", "w_rate"), start, strict=True))
-    )
+    job = Job({}, Recording("a.csv", t, {"w": np.zeros(t.size)}),
+              dict(zip(("w", "w_rate"), start, strict=True)))  # fmt: skip
     _, *state = found.simulator._states([job])[0]
     np.testing.assert_allclose(state, [left, right, 3 * right**2, 0.1, 0.2, 6 * right * 0.2])
     assert not found.warnings
-
-
-TIED = """<mujoco>
-  <option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/>
-  <worldbody>
-    <body><joint name="left" type="slide" axis="1 0 0" armature="0.1"/>
-      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
-    <body pos="1 0 0"><joint name="right" type="slide" damping="20" axis="1 0 0"/>
-      <geom pos="0.01 0 0" size="0.01" mass="0.1"/></body>
-  </worldbody>
-  <equality><joint joint1="right" joint2="left"/></equality>
-  <actuator><position name="servo" joint="left" kp="200" kv="10"/></actuator>
-</mujoco>
-"""
 
 
 @pytest.mark.parametrize("tie", [0.02, 0.01])
@@ -473,15 +446,6 @@ def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files, 
     at_rest = found.simulator._states([still], (("joint:right.tie", tie),))[0]
     assert abs(at_rest[1] - at_rest[2]) < 0.1 * abs(left - right)
     np.testing.assert_allclose(state, [left, right, rate, other], atol=0.02 * abs(left - right))
-
-
-URDF = """<robot name="swing">
-  <link name="base"/>
-  <link name="bob"><inertial><origin xyz="0 0 -0.2"/><mass value="0.5"/>
-    <inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial></link>
-  <joint name="pivot" type="continuous"><parent link="base"/><child link="bob"/><axis xyz="0 1 0"/></joint>
-</robot>
-"""
 
 
 @pytest.fixture
@@ -513,7 +477,12 @@ def test_a_column_of_torques_drives_a_urdf(urdf):
     assert "<mujoco" in text and len(lacking) == 1 and lacking[0].startswith(gain)
 
 
-def test_what_a_urdf_cannot_be_asked_is_said(urdf, tmp_path):
+def test_maps_of_a_urdf_leave_goals_to_their_user_and_say_what_cannot_be_asked(urdf, tmp_path):
+    columns = [("pivot_pos", None), ("pivot_effort", None), ("pivot_cmd", None)]
+    text, left = proposed_map(urdf()[0], columns, {})
+    described = tomllib.loads(text)["columns"]
+    assert described == {"pivot_pos": {"joint": "pivot"}, "pivot_effort": {"actuator": "pivot", "unit": "Nm"}}
+    assert left == ["pivot_cmd"]
     angle = MAP.partition("[columns.u]")[0]
     for column, line in (
         ('actuator = "pivot"\nunit = "rad"', "no servo to be commanded.*<position joint=.pivot"),
@@ -522,24 +491,14 @@ def test_what_a_urdf_cannot_be_asked_is_said(urdf, tmp_path):
         ('actuator = "pivot"\nkind = "force"', "no actuator to give a force.*unit = .Nm"),
         ('joint = "pivot"\nkind = "torque"', "no actuator to give a torque.*unit = .Nm"),
     ):
-        with pytest.raises(InputError, match=rf"columns\.u: .*{line}"):
-            load_mjcf(*urdf(f"{angle}[columns.u]\n{column}\n"))
+        refused(rf"columns\.u: .*{line}", load_mjcf, *urdf(f"{angle}[columns.u]\n{column}\n"))
     assert "no column drives the model" in load_mjcf(*urdf(angle)).warnings[0]
-
-
-def test_a_map_of_a_urdf_has_torques_drive_it_and_leaves_goals_to_its_user(urdf):
-    columns = [("pivot_pos", None), ("pivot_effort", None), ("pivot_cmd", None)]
-    text, left = proposed_map(urdf()[0], columns, {})
-    described = tomllib.loads(text)["columns"]
-    assert described == {"pivot_pos": {"joint": "pivot"}, "pivot_effort": {"actuator": "pivot", "unit": "Nm"}}
-    assert left == ["pivot_cmd"]
 
 
 @pytest.mark.parametrize(("name", "value", "stated"), [
     (None, None, ()), ("joint:left.armature", 0.5, ('armature="0.3"', 'armature="0.5"')),
     ("body:left.mass", 0.2, ('mass="0.1"', 'mass="0.2"')),
-    ("body:left.payload", 0.1, ('mass="0.1"', 'mass="0.2"')),
-])  # fmt: skip
+    ("body:left.payload", 0.1, ('mass="0.1"', 'mass="0.2"'))])  # fmt: skip
 def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, value, stated):
     finger = (
         '<body name="{0}" pos="0 {1} 0"><joint name="{0}" type="slide" axis="0 1 0" damping="6"'
@@ -549,12 +508,9 @@ def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, 
         '<mujoco><option timestep="0.001"/><worldbody>'
         + finger.format("left", 0.1, 0.3, 0.1) + finger.format("right", -0.1, 0.25, 0.15)
         + '</worldbody><equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality>'
-        '<actuator><position name="grip" joint="left" kp="400" kv="10"/></actuator></mujoco>'
-    )  # fmt: skip
-    described = (
-        '[columns.l]\njoint = "left"\n[columns.r]\njoint = "right"\n'
-        '[columns.u]\nactuator = "grip"\nunit = "m"\n'
-    )
+        '<actuator><position name="grip" joint="left" kp="400" kv="10"/></actuator></mujoco>')  # fmt: skip
+    described = ('[columns.l]\njoint = "left"\n[columns.r]\njoint = "right"\n'
+                 '[columns.u]\nactuator = "grip"\nunit = "m"\n')  # fmt: skip
     found, t = load_mjcf(*files(xml, described)), np.arange(0, 0.5, 0.001)
     log = Recording("a.csv", t, {"l": 0 * t, "r": 0 * t, "u": 0.02 * np.sin(9 * t)})
     found.effects([log])
@@ -569,9 +525,18 @@ def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, 
     assert np.abs(np.column_stack([read["l"], read["r"]]) - own).max() < 1e-9
 
 
-def test_joints_that_nothing_shows_are_said(files):
+def test_warnings_are_of_joints_that_nothing_shows_and_of_mujoco_counted(files, tmp_path, monkeypatch):
     found = load_mjcf(*files(FINGERS, '[columns.w]\njoint = "tip"\n'))
     assert "no column shows left, right, which the model moves as it runs freely" in found.warnings[0]
+    monkeypatch.chdir(tmp_path)
+    warned()
+    found, log, _ = loaded(files)
+    values = {n: p.nominal for n, p in found.simulator.parameters.items()}
+    pushed = log.with_columns({"u": np.full(len(log), 1e300)})
+    found.simulator.simulate_many([Job(values, pushed, {"q": 0.1, "q_rate": 0.0})] * 3)
+    (line,) = warned()
+    assert line.startswith("MuJoCo: ") and line.endswith(" times)") and warned() == []
+    assert not list(tmp_path.glob("*.TXT"))
 
 
 @pytest.mark.parametrize(("place", "at"), [("", 0.2), ('payload_at = {arm = "tool"}\n', 0.2),
@@ -582,33 +547,6 @@ def test_a_payload_is_a_point_mass_where_it_is_said_to_be(files, place, at):
     _, other = turning(files, place + TURN, ball)
     np.testing.assert_allclose(run(body_of_arm__payload=0.3), other(), atol=1e-7)
     assert np.abs(run() - other()).max() > 1e-3
-
-
-def test_a_load_is_carried_by_the_tool_that_is_fixed_to_the_last_link(files):
-    """A sensor in the wrist feels it there, and not on the link."""
-    tool = '<body name="hand" pos="0.3 0 0"><geom size="0.01" mass="0.2" contype="0" conaffinity="0"/></body>'
-    offered = turning(files, TURN, tool)[0].simulator.parameters
-    assert {"body:arm.mass", "body:hand.mass", "body:hand.com_x", "body:hand.payload"} <= {*offered}
-    assert "body:arm.payload" not in offered
-    stated = turning(files, 'payload_at = {arm = "tool"}\n' + TURN, tool)[0].simulator.parameters
-    assert "body:arm.payload" in stated and "body:hand.payload" not in stated
-
-
-def test_a_payload_where_nothing_is_is_said(files):
-    with pytest.raises(InputError, match=r"payload_at.arm: the model has no site tol.*tool"):
-        load_mjcf(*files(SERVO % "", 'payload_at = {arm = "tol"}\n' + TURN))
-    with pytest.raises(InputError, match=r"payload_at.arm: .*name of a site"):
-        load_mjcf(*files(SERVO % "", "payload_at = {arm = 3}\n" + TURN))
-
-
-def test_no_play_is_the_plain_model_and_play_lags_at_turns(files):
-    found, run = turning(files)
-    assert found.simulator.parameters["joint:turn.width"].effect == "command:u.backlash"
-    plain = run()
-    assert np.abs(run(joint_of_turn__width=1e-7) - plain).max() < 1e-3
-    apart = run(joint_of_turn__width=0.02) - plain
-    assert 3e-3 < np.abs(apart).max() < 0.06
-    assert np.abs(run() - plain).max() == 0.0
 
 
 def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(files):
@@ -631,18 +569,6 @@ def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(
     for line in ("sd = 1\n", '[sd]\n"body:bob.mass" = -1\n', "uncertain = 3\n"):
         with pytest.raises(InputError):
             made(line)
-
-
-def test_mujoco_s_warnings_are_counted_and_no_file_is_left(files, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    warned()
-    found, log, _ = loaded(files)
-    values = {n: p.nominal for n, p in found.simulator.parameters.items()}
-    pushed = log.with_columns({"u": np.full(len(log), 1e300)})
-    found.simulator.simulate_many([Job(values, pushed, {"q": 0.1, "q_rate": 0.0})] * 3)
-    (line,) = warned()
-    assert line.startswith("MuJoCo: ") and line.endswith(" times)") and warned() == []
-    assert not list(tmp_path.glob("*.TXT"))
 
 
 def test_a_law_acts_with_its_own_numbers_where_these_are_as_it_came(files):

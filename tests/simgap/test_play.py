@@ -13,12 +13,12 @@ import threading
 
 import numpy as np
 import pytest
+from refusals import refused
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from estimation.identification import identify_aligned
 from experiments.play_session import browser, find_browser, save, served, stack
-from hmmseg.errors import InputError
 from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import read_rig
 from hmmseg.io.task import read_task
@@ -29,6 +29,9 @@ from simgap.play.server import PlayServer
 from simgap.play.session import Session, default_rig, default_task
 from simgap.play.world import effect_values, felt_effects, scene_with, sensed
 from simgap.world.properties import PAPER_BLOCKS
+
+NONSENSE = ("", "[]", "null", '{"kind": "aim"}', '{"kind": "aim", "x": "a", "y": 0, "closed": 1}', "[" * 3000,
+            '{"kind": "effect", "name": ["x"]}', '{"kind": "touch", "tips": [[1]]}', b"\xff")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +46,6 @@ def session(made):
 
 
 def perform(session):
-    """Pick block1 up and set it onto block2, as a mouse would."""
     (x1, x2), top = (session.x[name] for name in ("block1", "block2")), session.top
     half, rest = PAPER_BLOCKS["block1"].height / 2, PAPER_BLOCKS["block2"].height
     for x, y, closed, ms in (
@@ -78,7 +80,17 @@ def test_a_session_stacks_and_its_trial_identifies_the_blocks(session, tmp_path)
     assert not list(tmp_path.glob(".*"))
 
 
-def test_the_spring_shows_the_force(session):
+def test_fingers_move_by_touches_through_springs_that_show_the_force_and_not_by_nonsense(session, tmp_path):
+    before = session.target.copy()
+    session.aim(float("nan"), 0.1, True)
+    session.touch(np.array([[np.inf, 0.0], [0.0, 0.0]]))
+    np.testing.assert_array_equal(session.target, before)
+    assert session.fingers is None
+    with pytest.raises(ValueError, match="less than a second"):
+        session.save(tmp_path)
+    session.touch(np.array([[0.17, 0.04], [0.12, 0.05]]))
+    session.advance(2000)
+    np.testing.assert_allclose(session.nominal.position, [[0.12, 0.05], [0.17, 0.04]], atol=1e-3)
     session.aim(session.x["block1"], 0.008, False)
     session.advance(1500)
     session.aim(session.x["block1"], 0.008, True, grip=2.0)
@@ -88,23 +100,7 @@ def test_the_spring_shows_the_force(session):
     assert 450.0 * stretch == pytest.approx(2.0, rel=0.05)
 
 
-def test_two_touches_move_each_finger(session):
-    session.touch(np.array([[0.17, 0.04], [0.12, 0.05]]))
-    session.advance(2000)
-    np.testing.assert_allclose(session.nominal.position, [[0.12, 0.05], [0.17, 0.04]], atol=1e-3)
-
-
-def test_numbers_that_are_none_change_nothing(session, tmp_path):
-    before = session.target.copy()
-    session.aim(float("nan"), 0.1, True)
-    session.touch(np.array([[np.inf, 0.0], [0.0, 0.0]]))
-    np.testing.assert_array_equal(session.target, before)
-    assert session.fingers is None
-    with pytest.raises(ValueError, match="less than a second"):
-        session.save(tmp_path)
-
-
-def test_an_effect_beside_is_felt(session):
+def test_effects_beside_are_felt_and_a_diagnosis_names_them(session, tmp_path):
     session.compare_with(session.world_with({"force_gain": {"gain": 0.5}}))
     session.aim(session.x["block1"], 0.008, False)
     session.advance(1500)
@@ -114,18 +110,25 @@ def test_an_effect_beside_is_felt(session):
     assert other["force"][0][0] == pytest.approx(1.5 * nominal["force"][0][0], rel=1e-6)
     np.testing.assert_allclose(other["blocks"], nominal["blocks"], atol=1e-9)
     assert session.scene()["effects"] == {"force_gain": {"gain": 0.5}}
+    path = tmp_path / "d.json"
+    document = {"format": "hmmseg.diagnose/1", "verdict": "named", "causes": ["force_lowpass"],
+                "effects": {"force_lowpass": {"parameters": {"time_constant": {"mean": 0.04}}}}}  # fmt: skip
+    path.write_text(json.dumps(document))
+    assert diagnosed(path) == {"force_lowpass": {"time_constant": 0.04}}
+    path.write_text(json.dumps(document | {"causes": [], "verdict": "none"}))
+    refused("a diagnosis that names a cause", diagnosed, path)
+    path.write_text(json.dumps(document | {"causes": ["backlash"]}))
+    refused("backlash cannot be felt", diagnosed, path)
+    path.write_text(json.dumps({"format": "hmmseg.identify/1"}))
+    assert diagnosed(path) == {}
 
 
-def test_scene_effects_change_the_scene():
+def test_effects_change_the_scene_by_the_parameters_of_one_form_alone():
     effects = {"grip_slip": {"mu": 0.1}, "table_compliance": {"stiffness": 900.0},
                "fingertip_compliance": effect_values("fingertip_compliance")}  # fmt: skip
     rig, blocks, around = scene_with(effects, default_rig(), PAPER_BLOCKS)
-    assert {block.friction for block in blocks.values()} == {0.1}
-    assert around.support_stiffness == 900.0
+    assert {block.friction for block in blocks.values()} == {0.1} and around.support_stiffness == 900.0
     assert rig.fingertip.normal_stiffness == 800.0
-
-
-def test_an_effect_has_the_parameters_of_one_form_alone():
     gain = {key: value for key, value in effect_values("force_gain").items() if value}
     assert gain.keys() == {"gain"}
     one = {key: value for key, value in effect_values("force_gain", {"fx1": 0.1}).items() if value}
@@ -138,47 +141,21 @@ def test_every_offered_effect_can_be_felt(name):
     force = np.ones((400, 2, 2)) * np.linspace(0, 2, 400)[:, None, None]
     place = np.zeros((400, 2, 2))
     out = sensed({name: effect_values(name)}, t, place, place, force, default_rig())
-    assert out.shape == force.shape
-    assert np.isfinite(out).all()
-
-
-def test_a_diagnosis_names_what_stands_beside(tmp_path):
-    path = tmp_path / "d.json"
-    document = {"format": "hmmseg.diagnose/1", "verdict": "named", "causes": ["force_lowpass"],
-                "effects": {"force_lowpass": {"parameters": {"time_constant": {"mean": 0.04}}}}}  # fmt: skip
-    path.write_text(json.dumps(document))
-    assert diagnosed(path) == {"force_lowpass": {"time_constant": 0.04}}
-    path.write_text(json.dumps(document | {"causes": [], "verdict": "none"}))
-    with pytest.raises(InputError, match="a diagnosis that names a cause"):
-        diagnosed(path)
-    path.write_text(json.dumps(document | {"causes": ["backlash"]}))
-    with pytest.raises(InputError, match="backlash cannot be felt"):
-        diagnosed(path)
-    path.write_text(json.dumps({"format": "hmmseg.identify/1"}))
-    assert diagnosed(path) == {}
+    assert out.shape == force.shape and np.isfinite(out).all()
 
 
 @pytest.mark.parametrize(("arguments", "line"), [
     (["nowhere.json"], "nowhere.json: no such file"),
     (["--effect", "gravity"], "effect gravity: cannot be felt in a played world"),
-    (["--rig", "nowhere.toml"], "nowhere.toml: no such file"),
-])  # fmt: skip
+    (["--rig", "nowhere.toml"], "nowhere.toml: no such file")])  # fmt: skip
 def test_bad_input_is_told_in_one_line(arguments, line, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["play", *arguments, "--no-open"]) == 2
-    assert line in capsys.readouterr().err
+    assert main(["play", *arguments, "--no-open"]) == 2 and line in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-NONSENSE = (
-    "", "[]", "null", '{"kind": "aim"}', '{"kind": "aim", "x": "a", "y": 0, "closed": 1}', "[" * 3000,
-    '{"kind": "effect", "name": ["x"]}', '{"kind": "touch", "tips": [[1]]}', b"\xff",
-)  # fmt: skip
 
 
 @pytest.fixture
 def server(session, tmp_path):
-    """A running server, its address without the scheme, and its output folder."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, daemon=True)
     thread.start()
@@ -192,7 +169,6 @@ def server(session, tmp_path):
 
 
 def answers(socket, kind):
-    """The next message of a kind."""
     while (told := json.loads(socket.recv(timeout=30)))["kind"] != kind:
         pass
     return told
@@ -212,25 +188,19 @@ def test_the_socket_plays_and_shrugs_at_nonsense(server):
         while answers(socket, "frame")["t"] < start + 1.2:
             pass
         assert abs(np.mean(answers(socket, "frame")["worlds"][0]["tips"], axis=0)[0] - 0.1) < 0.01
-        with (
-            pytest.raises(ConnectionClosed, match="somebody plays already"),
-            connect(f"ws://{where}socket", origin=f"http://{where.rstrip('/')}") as second,
-        ):
+        with (pytest.raises(ConnectionClosed, match="somebody plays already"),
+              connect(f"ws://{where}socket", origin=f"http://{where.rstrip('/')}") as second):  # fmt: skip
             second.recv(timeout=30)
         socket.send(json.dumps({"kind": "save"}))
         assert answers(socket, "saved")["file"] == str(folder / "trial_01.csv")
 
 
-def test_another_page_is_refused(server):
+def test_other_pages_and_odd_headers_are_refused_and_the_page_says_what_it_may_load(server):
     where, _ = server
     with pytest.raises(InvalidStatus, match="403"):
         connect(f"ws://{where}socket", origin="http://evil.example").close()
     with pytest.raises(InvalidStatus, match="403"):
         connect(f"ws://{where}socket", additional_headers={"Host": "evil.example"}).close()
-
-
-def test_the_page_says_what_it_may_load_and_odd_headers_are_refused(server):
-    where, _ = server
     host, port = where.rstrip("/").split(":")
 
     def answer(*headers: str) -> str:
@@ -253,67 +223,61 @@ def test_a_session_replaces_no_file(session, tmp_path):
     assert [session.save(tmp_path)[-1].name for _ in range(2)] == ["trial_01.csv", "trial_03.csv"]
     assert (tmp_path / "trial_02.csv").read_text() == "mine"
     (tmp_path / "rig.toml").write_text("rate = 7")
-    with pytest.raises(InputError, match=r"rig\.toml: is there already, and not this session's"):
-        session.save(tmp_path)
+    refused(r"rig\.toml: is there already, and not this session's", session.save, tmp_path)
     assert (tmp_path / "rig.toml").read_text() == "rate = 7" and len(list(tmp_path.iterdir())) == 6
 
 
-@pytest.mark.slow
-def test_a_mouse_in_a_real_browser_stacks_the_blocks(tmp_path):
+@pytest.fixture
+def page(tmp_path):
     if find_browser() is None:
         pytest.skip("no Chromium on this machine")
     with served(tmp_path) as address, browser(address) as page:
-        stack(page, "block1", "block2")
-        (x1, y1), (x2, _) = page.value("frame.worlds[0].blocks")
-        assert save(page).endswith("trial_01.csv")
+        yield page
+
+
+@pytest.mark.slow
+def test_a_mouse_in_a_real_browser_stacks_the_blocks(page, tmp_path):
+    stack(page, "block1", "block2")
+    (x1, y1), (x2, _) = page.value("frame.worlds[0].blocks")
+    assert save(page).endswith("trial_01.csv")
     assert y1 == pytest.approx(PAPER_BLOCKS["block2"].height + PAPER_BLOCKS["block1"].height / 2, abs=3e-4)
     assert abs(x1 - x2) < 3e-3
     check_identified(tmp_path)
 
 
 @pytest.mark.slow
-def test_two_touches_in_a_real_browser_lift_a_block(tmp_path):
-    """Each finger follows its own touch, through its own spring; a squeeze by both lifts what is between."""
-    if find_browser() is None:
-        pytest.skip("no Chromium on this machine")
-    with served(tmp_path) as address, browser(address) as page:
-        page.until("scene && frame && frame.t > 0.3")
-        x, y = page.value("frame.worlds[0].blocks[0]")
-        wide, half = page.value("scene.home")[1], page.value("Object.values(scene.blocks)[0][0]") / 2
-        page.touch("touchStart", (x - half - 0.015, wide), (x + half + 0.015, wide))
-        page.wait(0.8, False)
-        left, right = page.value("frame.worlds[0].tips")
-        assert right[0] - left[0] > 2 * half + 0.015
-        for apart, height in ((0.015, y), (-0.008, y), (-0.008, y + 0.012)):
-            page.touch("touchMove", (x - half - apart, height), (x + half + apart, height))
-            page.wait(1.0, False)
-        assert (
-            page.value("frame.worlds[0].force[0][0]") > 1.0
-            and page.value("frame.worlds[0].force[1][0]") < -1.0
-        )
-        assert page.value("frame.worlds[0].blocks[0][1]") - y > 0.005
+def test_two_touches_in_a_real_browser_lift_a_block(page):
+    page.until("scene && frame && frame.t > 0.3")
+    x, y = page.value("frame.worlds[0].blocks[0]")
+    wide, half = page.value("scene.home")[1], page.value("Object.values(scene.blocks)[0][0]") / 2
+    page.touch("touchStart", (x - half - 0.015, wide), (x + half + 0.015, wide))
+    page.wait(0.8, False)
+    left, right = page.value("frame.worlds[0].tips")
+    assert right[0] - left[0] > 2 * half + 0.015
+    for apart, height in ((0.015, y), (-0.008, y), (-0.008, y + 0.012)):
+        page.touch("touchMove", (x - half - apart, height), (x + half + apart, height))
+        page.wait(1.0, False)
+    assert (page.value("frame.worlds[0].force[0][0]") > 1.0
+            and page.value("frame.worlds[0].force[1][0]") < -1.0)  # fmt: skip
+    assert page.value("frame.worlds[0].blocks[0][1]") - y > 0.005
 
 
 @pytest.mark.slow
-def test_a_second_world_in_a_real_browser_is_seen_and_felt(tmp_path):
-    """An effect chosen in the page stands beside the nominal world, with the same hand in both."""
-    if find_browser() is None:
-        pytest.skip("no Chromium on this machine")
-    with served(tmp_path) as address, browser(address) as page:
-        page.until("scene && frame && frame.t > 0.3")
-        assert page.value("$('other').hidden") and page.value("frame.worlds.length") == 1
-        page.choose("effect", "force_gain")
-        page.until("Object.keys(scene.effects).length === 1 && frame.worlds.length === 2 && frame.t > 0.3")
-        assert not page.value("$('other').hidden") and page.value("$('other').width") > 200
-        x, y = page.value("frame.worlds[0].blocks[0]")
-        for kind in ("mouseMoved", "mousePressed"):
-            page.mouse(kind, x, y)
-            page.wait(1.2, False)
-        gain = page.value("scene.effects.force_gain.gain")
-        one, other = (world["force"][0][0] for world in page.value("frame.worlds"))
-        assert one > 1.0 and other / one == pytest.approx(1 + gain, rel=0.05)
-        page.choose("effect", "")
-        page.until("frame.worlds.length === 1 && $('other').hidden")
+def test_a_second_world_in_a_real_browser_is_seen_and_felt(page):
+    page.until("scene && frame && frame.t > 0.3")
+    assert page.value("$('other').hidden") and page.value("frame.worlds.length") == 1
+    page.choose("effect", "force_gain")
+    page.until("Object.keys(scene.effects).length === 1 && frame.worlds.length === 2 && frame.t > 0.3")
+    assert not page.value("$('other').hidden") and page.value("$('other').width") > 200
+    x, y = page.value("frame.worlds[0].blocks[0]")
+    for kind in ("mouseMoved", "mousePressed"):
+        page.mouse(kind, x, y)
+        page.wait(1.2, False)
+    gain = page.value("scene.effects.force_gain.gain")
+    one, other = (world["force"][0][0] for world in page.value("frame.worlds"))
+    assert one > 1.0 and other / one == pytest.approx(1 + gain, rel=0.05)
+    page.choose("effect", "")
+    page.until("frame.worlds.length === 1 && $('other').hidden")
 
 
 def test_the_command_ends_with_its_terminal(tmp_path):
@@ -323,19 +287,16 @@ def test_the_command_ends_with_its_terminal(tmp_path):
     command = [sys.executable, "-c", program, "play", "--no-open", "--output", str(tmp_path / "o")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stdout is not None
             next(line for line in process.stdout if "http://127.0.0.1:" in line)
             process.send_signal(signal.SIGINT)
             _, err = process.communicate(timeout=60)
         finally:
             process.kill()
-    assert (process.returncode, err) == (0, "")
-    assert not (tmp_path / "o").exists()
+    assert (process.returncode, err) == (0, "") and not (tmp_path / "o").exists()
 
 
 @pytest.mark.parametrize("at", range(4))
 def test_a_file_that_cannot_be_put_in_place_leaves_no_half_of_it(at, session, tmp_path, monkeypatch):
-    """Each rename of a session is refused in turn: what is there is whole, and the next try saves it."""
     session.reset()
     session.advance(1100)
     real, calls = os.replace, iter(range(10))

@@ -31,10 +31,8 @@ class Posed:
 
 
 def tumbling(name: str = "log.csv") -> Recording:
-    """A body that turns about a slanted axis and flies."""
     t = np.arange(0.0, 0.5, 0.01)
-    half = 1.5 * t
-    axis = np.array([0.6, 0.0, 0.8])
+    half, axis = 1.5 * t, np.array([0.6, 0.0, 0.8])
     turn = {"qw": np.cos(half)} | {f"q{a}": axis[k] * np.sin(half) for k, a in enumerate("xyz")}
     return Recording(name, t, {"x": 0.3 * t, "y": 0.1 + 0 * t, "z": 1 - 4.9 * t**2} | turn)
 
@@ -56,13 +54,9 @@ def test_what_a_pose_is_read_through_is_undone(name, theta):
     assert np.allclose((turn**2).sum(0), 1.0, atol=1e-4)
 
 
-def test_an_offset_turns_with_the_body():
-    """About the vertical by half a turn, an arm along x points back."""
+def test_offsets_turn_with_the_body_and_each_log_has_its_own_shift():
     turn = np.array([[np.cos(np.pi / 2)], [0.0], [0.0], [np.sin(np.pi / 2)]])
     assert np.allclose(readouts.rotated(turn, np.array([0.1, 0.0, 0.2]))[:, 0], [-0.1, 0.0, 0.2])
-
-
-def test_each_log_has_its_own_shift_and_no_component_of_a_turn_a_gain():
     logs = [tumbling("a.csv"), tumbling("b.csv")]
     setting = Setting(Posed(), logs)
     shift, offset = readouts.by_log(setting)
@@ -73,7 +67,7 @@ def test_each_log_has_its_own_shift_and_no_component_of_a_turn_a_gain():
     assert setting.alone() == ["x", "y", "z"] and setting.late_alone() == []
 
 
-def test_a_brief_touch_counts_and_a_brief_break_does_not():
+def test_brief_touches_count_but_breaks_do_not_and_what_slows_down_does_not_rest():
     pytest.importorskip("mujoco")
     from simgap.simulators.mjcf.model import closed
 
@@ -82,6 +76,10 @@ def test_a_brief_touch_counts_and_a_brief_break_does_not():
     sets = [none, none, pair, none, none, none, none, none, pair, none, pair, none]
     told = closed(t, sets)
     assert [bool(s) for s in told] == [bool(i in (2, 8, 9, 10)) for i in range(12)]
+    t = np.arange(0, 1.0, 0.01)
+    log = Recording("log.csv", t, {"q": np.where(t < 0.5, 1 - np.exp(-t / 0.1), 1 - np.exp(-5))})
+    rests, rate = resting(log, {"q": 1.0}), np.exp(-t / 0.1) / 0.1
+    assert rests[t > 0.53].all() and not rests[(rate * 0.04 > AT_REST) & (t < 0.47)].any()
 
 
 DROP = """<mujoco><option timestep="0.002"/><worldbody>
@@ -116,19 +114,16 @@ def dropped(tmp_path_factory):
 def test_flight_and_contact_are_told_apart(dropped):
     simulator, log = dropped
     times, what = simulator.contact_states(log)
-    fall = np.sqrt(2 * 0.45 / 9.81)
-    first = times[what.index(frozenset({(0, 1)}))]
+    fall, first = np.sqrt(2 * 0.45 / 9.81), times[what.index(frozenset({(0, 1)}))]
     assert fall - 0.03 < first < fall + 0.01 and not what[0]
     noise = dict.fromkeys(POSE, 1e-3)
     windows = cut(simulator, [log], noise, 0.2)
     assert windows[0].regime == FLIES and windows[-1].regime == RESTS
     assert {w.regime for w in windows} <= {FLIES, STRIKES, RESTS}
     assert any(abs(log.t[w.begin] - first) < 0.011 for w in windows)
-    phases = phases_of(simulator, [log], windows)
-    rows = rows_of([log], windows, noise)
+    phases, rows = phases_of(simulator, [log], windows), rows_of([log], windows, noise)
     names = np.array(phases.names)[phases.of(rows)]
-    assert {*names} == {w.regime for w in windows}
-    assert all(names == np.array(REGIMES)[rows.regime])
+    assert {*names} == {w.regime for w in windows} and all(names == np.array(REGIMES)[rows.regime])
 
 
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
@@ -151,18 +146,7 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     assert max(each) <= 1.01 / 0.02**2  # no window in contact tells more than the scale's usual size
 
 
-def test_what_lies_still_rests_and_what_slows_down_does_not():
-    t = np.arange(0, 1.0, 0.01)
-    log = Recording("log.csv", t, {"q": np.where(t < 0.5, 1 - np.exp(-t / 0.1), 1 - np.exp(-5))})
-    rests = resting(log, {"q": 1.0})
-    rate = np.exp(-t / 0.1) / 0.1
-    assert rests[t > 0.53].all()
-    assert not rests[(rate * 0.04 > AT_REST) & (t < 0.47)].any()
-
-
-def test_a_body_at_rest_is_compared_where_the_model_lies_itself(dropped):
-    """It begins 1.5 mm within the board, for it is read on a scale of 0.97, and has left it by the first
-    sample."""
+def test_a_body_at_rest_is_compared_where_it_lies_which_differs_from_time_to_time(dropped):
     simulator, log = dropped
     composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
     rows, base = composed.rows, base_at(composed, {})
@@ -172,12 +156,6 @@ def test_a_body_at_rest_is_compared_where_the_model_lies_itself(dropped):
     np.testing.assert_allclose(settled / base.rows[still][20:], 0.97, atol=2e-3)
     calm = composed.calm()
     assert {w.regime for w in calm.windows} == {FLIES, RESTS} and calm.calm() is calm
-
-
-def test_where_a_body_comes_to_lie_differs_from_time_to_time(dropped):
-    """By channel, alike at all samples of a window of rest, and in no other window."""
-    simulator, log = dropped
-    composed = Composed.of(simulator, [log], {}, dict.fromkeys(POSE, 1e-4), 0.2)
     linear = linearise(composed, {}, [])
     cov = covariances(composed, linear)
     for block in cov.blocks:
@@ -214,8 +192,7 @@ def test_in_contact_a_fourth_of_the_step_by_another_integrator_is_the_run_itself
     point = {"option.timestep": {"timestep": -0.75}, "option.integrator": {"integrator": 1.0}}
     composed = Composed.of(found.simulator, [log], effects, {"q": 1e-4}).moved(point)
     composed = replace(composed, windows=tuple(replace(w, regime=STRIKES) for w in composed.windows))
-    starts = composed.starts(point)
-    finer = load(0.002, "Euler")
+    starts, finer = composed.starts(point), load(0.002, "Euler")
     finer.effects([log])
     for window, start, ours in zip(composed.windows, starts, composed.rolled(point, starts), strict=True):
         own = finer.simulator.simulate({}, log.window(window.begin, window.end), start)

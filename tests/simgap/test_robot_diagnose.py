@@ -15,8 +15,7 @@ RATE, WIDTH = 50.0, 0.03
 
 
 class Servo:
-    """A joint that follows its command but for a band: of errors that the controller does not see, or of
-    friction, which are one and the same here."""
+    """A joint that follows its command but for a band of unseen errors, or of friction."""
 
     parameters = {  # noqa: RUF012
         n: {"nominal": 0.0, "sd": 0.01, "unit": "rad", "low": 0.0, "high": 0.2} for n in ("band", "friction")
@@ -28,16 +27,11 @@ class Servo:
     window = 2.0
 
     def simulate(self, parameters, recording, start=None):
-        """Positions."""
-        return {
-            "pos": follow(
-                parameters["band"] + parameters["friction"], recording["cmd"], start["pos"] if start else 0.0
-            )
-        }
+        return {"pos": follow(parameters["band"] + parameters["friction"], recording["cmd"], start["pos"]
+                              if start else 0.0)}  # fmt: skip
 
 
 def follow(width: float, command: np.ndarray, begin: float, pushed: np.ndarray | None = None) -> np.ndarray:
-    """A first-order lag towards the command outside of the band."""
     out = np.full(command.size, begin)
     for i in range(command.size - 1):
         error = command[i] - out[i]
@@ -47,7 +41,6 @@ def follow(width: float, command: np.ndarray, begin: float, pushed: np.ndarray |
 
 
 def logs(count: int = 4) -> list[Recording]:
-    """Triangles of several paces, and pushes that no candidate explains."""
     rng, t, out = np.random.default_rng(3), np.arange(0, 8, 1 / RATE), []
     for k in range(count):
         command = 0.1 * np.abs(((0.2 + 0.1 * k) * t) % 2 - 1)
@@ -57,24 +50,20 @@ def logs(count: int = 4) -> list[Recording]:
     return out
 
 
-def test_two_that_do_the_same_are_a_set_wherever_the_search_ended():
+def test_what_does_the_same_is_a_set_and_logs_of_one_group_are_held_out_together():
     found = diagnose(checked(Servo(), "servo"), logs())
     told = body(found)
-    assert told["verdict"] == "set"
-    assert {*told["causes"], *told["indistinguishable"]} == {"band", "friction"}
+    assert told["verdict"] == "set" and {*told["causes"], *told["indistinguishable"]} == {"band", "friction"}
     for name in ("band", "friction"):
         (width,) = told["effects"][name]["parameters"].values()
         assert abs(width["mean"] - WIDTH) < 0.2 * WIDTH, name
+    rows = object.__new__(Rows)
+    object.__setattr__(rows, "log", np.repeat(np.arange(4), 3))  # all that folds are made of
+    fold = folds_of(rows, 4, groups=[100, 200, 100, 200])
+    assert fold.tolist() == [0] * 3 + [1] * 3 + [0] * 3 + [1] * 3
 
 
 @pytest.mark.parametrize("groups", [[1, 2, 1], [4, 4]])
 def test_groups_that_nothing_can_be_held_out_by_are_refused(groups):
     with pytest.raises(InputError, match=r"groups: are \d in \d groups for 2 logs; expected"):
         diagnose(checked(Swing(), "Swing"), [log(1), log(2)], groups=groups)
-
-
-def test_logs_of_one_group_are_held_out_together():
-    rows = object.__new__(Rows)
-    object.__setattr__(rows, "log", np.repeat(np.arange(4), 3))  # all that folds are made of
-    fold = folds_of(rows, 4, groups=[100, 200, 100, 200])
-    assert fold.tolist() == [0] * 3 + [1] * 3 + [0] * 3 + [1] * 3

@@ -46,7 +46,7 @@ def test_a_planted_value_is_found_from_wrong_starts(damped, start):
     assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
 
 
-def test_a_fit_comes_back_from_where_the_simulator_diverges():
+def test_a_fit_and_a_search_come_back_from_where_the_simulator_diverges(damped):
     class Brittle(Swing):
         def simulate(self, parameters, recording, start=None):
             out = super().simulate(parameters, recording, start)
@@ -55,29 +55,6 @@ def test_a_fit_comes_back_from_where_the_simulator_diverges():
     model = composed(Brittle(), [log(0, viscous=VISCOUS)])
     found = fit(model, {"viscous": {"viscous": 0.2}})
     assert found["viscous"]["viscous"] == pytest.approx(VISCOUS, rel=0.05)
-
-
-def test_a_large_cause_is_proposed_near_its_size():
-    """Ten times its usual size; a straight line from the usual size leads to 0.08."""
-    model = composed(Swing(), [log(s, viscous=0.1) for s in range(2)])
-    search = Search(model, tuple(model.effects), model.rows.log)
-    sets, _ = search.propose(search.nothing(), search.wanted)
-    found = point_of(model.effects, sets.fit(("viscous",), 0), ("viscous",), search.along)
-    assert found["viscous"]["viscous"] == pytest.approx(0.1, rel=0.1)
-
-
-def test_what_does_the_same_by_the_same_share_is_judged_too():
-    model = composed(Swing(), [log(s, torque_scale=1.4) for s in range(2)])
-    search = Search(model, tuple(model.effects), model.rows.log)
-    best = search.forced(("torque_scale",))
-    search._judge_twins(best, "torque_scale")
-    (twin,) = {*search.fitted} - {frozenset(), frozenset(best.names)}
-    assert twin == {"command:torque.gain"}
-    assert search.fitted[twin].score == pytest.approx(best.score, abs=2.0)
-    assert search.fitted[twin].point["command:torque.gain"]["gain"] == pytest.approx(0.4, abs=0.01)
-
-
-def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing, names = search.nothing(), tuple(damped.effects)
     best = replace(nothing, names=names, point={n: e.neutral() for n, e in damped.effects.items()})
@@ -87,6 +64,21 @@ def test_no_replacement_is_sought_where_the_simulator_diverges_without_a_cause(d
             nothing, names=rest, linear=replace(nothing.linear, moved={}, diverged=rest), score=-np.inf
         )
     assert search._exchange(best) is None
+
+
+def test_causes_are_proposed_near_their_size_and_twins_are_judged_too():
+    model = composed(Swing(), [log(s, viscous=0.1) for s in range(2)])
+    search = Search(model, tuple(model.effects), model.rows.log)
+    sets, _ = search.propose(search.nothing(), search.wanted)
+    found = point_of(model.effects, sets.fit(("viscous",), 0), ("viscous",), search.along)
+    assert found["viscous"]["viscous"] == pytest.approx(0.1, rel=0.1)
+    model = composed(Swing(), [log(s, torque_scale=1.4) for s in range(2)])
+    search = Search(model, tuple(model.effects), model.rows.log)
+    best = search.forced(("torque_scale",))
+    search._judge_twins(best, "torque_scale")
+    (twin,) = {*search.fitted} - {frozenset(), frozenset(best.names)}
+    assert twin == {"command:torque.gain"} and search.fitted[twin].score == pytest.approx(best.score, abs=2.0)
+    assert search.fitted[twin].point["command:torque.gain"]["gain"] == pytest.approx(0.4, abs=0.01)
 
 
 def test_a_set_is_fitted_again_from_a_larger_one_that_promises_more(damped, monkeypatch):
@@ -100,22 +92,11 @@ def test_a_set_is_fitted_again_from_a_larger_one_that_promises_more(damped, monk
     assert search._without(both, other).names == ("viscous",)
 
 
-def test_what_lines_from_starts_are_wrong_by_does_not_hide_in_a_sets_own_discrepancy(damped):
+def test_what_is_settled_stays_and_lines_from_starts_hide_in_no_discrepancy(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing = search.nothing()
     loud, quiet = (replace(nothing, discrepancy=d) for d in ({"angle": 1e3}, {}))
     assert search._begun_anew(loud, quiet)[2] > 2 * search._begun_anew(loud, loud)[2] > 0
-
-
-def test_a_search_takes_fewer_windows_where_each_has_many_rows(damped, monkeypatch):
-    every = damped.thinned()
-    monkeypatch.setattr("simgap.robots.model.MOST_ROWS", -(-damped.rows.log.size // 2))
-    assert damped.thinned() == every[::2]
-    none = tuple(slice(0, 0) for _ in every)  # readings that are missing throughout
-    assert replace(damped, rows=replace(damped.rows, of=none)).thinned() == every
-
-
-def test_what_is_settled_stays(damped):
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     nothing = search.nothing()
     first = search.fit(("viscous",), {"viscous": {"viscous": 0.0}}, [nothing.whiten])
@@ -124,15 +105,19 @@ def test_what_is_settled_stays(damped):
     assert abs(again.score - first.score) < BETTER
 
 
-def test_rivals_are_fitted_to_the_end_before_they_are_ruled_out(damped, monkeypatch):
+def test_searches_thin_windows_of_many_rows_and_fit_rivals_to_the_end(damped, monkeypatch):
+    every = damped.thinned()
+    monkeypatch.setattr("simgap.robots.model.MOST_ROWS", -(-damped.rows.log.size // 2))
+    assert damped.thinned() == every[::2]
+    none = tuple(slice(0, 0) for _ in every)  # readings that are missing throughout
+    assert replace(damped, rows=replace(damped.rows, of=none)).thinned() == every
     search, again = Search(damped, tuple(damped.effects), damped.rows.log), []
     best = search.nothing()
     for name, score, promise in (("near", -4.0, -1.0), ("far", -9.0, -4.0), ("settled", -2.0, -2.0)):
         one = replace(best, names=(name,), score=best.score + score, promise=best.score + promise)
         search.fitted[frozenset(one.names)] = one
     monkeypatch.setattr(search, "fit", lambda names, *_: again.append(names))
-    assert search._settled(best) is best
-    assert again == [("near",)]
+    assert search._settled(best) is best and again == [("near",)]
 
 
 @pytest.mark.parametrize(("gain", "better"), [(0.0, True), (9.0, True), (-9.0, False)])
@@ -140,12 +125,9 @@ def test_of_what_explains_alike_the_simpler_is_preferred(damped, monkeypatch, ga
     search = Search(damped, tuple(damped.effects), damped.rows.log)
     held_out = {"coulomb": np.full(4, gain), "stribeck": np.zeros(4)}
     monkeypatch.setattr(search, "_held_out", lambda one, _: held_out[one.names[0]])
-    one, two = (
-        SimpleNamespace(names=(n,), score=score, sets=SimpleNamespace(size=size), discrepancy={})
-        for n, score, size in (("coulomb", 0.5, (1,)), ("stribeck", 0.0, (2,)))
-    )
-    assert search._is_better(one, two) is better
-    assert not search._is_better(two, one)
+    one, two = (SimpleNamespace(names=(n,), score=score, sets=SimpleNamespace(size=size), discrepancy={})
+                for n, score, size in (("coulomb", 0.5, (1,)), ("stribeck", 0.0, (2,))))  # fmt: skip
+    assert search._is_better(one, two) is better and not search._is_better(two, one)
 
 
 def test_a_small_gap_whose_only_cause_is_doubted_is_none():
@@ -157,8 +139,7 @@ def test_a_small_gap_whose_only_cause_is_doubted_is_none():
     far = Shrinkage(1.0, 1.0, 1.0, 0.0, (0.0, 0.0), {}, *np.zeros((3, 1)))
     phases = phases_of(model.simulator, model.recordings, model.windows)
     found = verdict_on(search, best, far, phases, 0, False)
-    assert found.detection.p_value < 0.01 and found.doubts
-    assert (found.verdict, found.causes) == ("none", ())
+    assert found.detection.p_value < 0.01 and found.doubts and (found.verdict, found.causes) == ("none", ())
 
 
 class Two:
@@ -168,7 +149,6 @@ class Two:
     channels = {f"{n}_{side}": c for side in "ab" for n, c in Swing.channels.items()}  # noqa: RUF012
 
     def simulate(self, parameters, recording, start=None):
-        """Both angles."""
         out = {}
         for side in "ab":
             mine = {n: parameters[f"{n}_{side}"] for n in Swing.parameters}
@@ -191,20 +171,17 @@ def two(seed: int, **changed: float) -> Recording:
 
 @pytest.mark.slow
 def test_a_set_is_judged_by_the_discrepancy_that_it_leaves():
-    """By the discrepancy that is left without it, a cause seems to gain a third of what it does: what nothing
-    explains is as large as the cause's own doing. Once fitted, none is left where it acts."""
+    """By the discrepancy that is left without it, a cause seems to gain a third of what it does."""
     model = composed(Two(), [two(s, viscous_a=0.004, viscous_b=0.0005) for s in range(4)])
     search, names = Search(model, tuple(model.effects), model.rows.log), ("viscous_a", "viscous_b")
     none = search.nothing()
     assert {*none.discrepancy} >= {"angle_a", "angle_b"}
     sets, levels = search.propose(none, names)
     hidden = float(sets.scores([names[:1]], 0)[0] - sets.scores([()], 0)[0])
-    large, small, both = (
-        search.fit(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005} for n in one}, [levels[-1]])
-        for one in (names[:1], names[1:], names)
-    )
-    assert large.score - none.score > 1.5 * hidden > 30
-    assert both.score > large.score + 20 > small.score + 40
+    large, small, both = (search.fit(one, {n: {n: 0.004 if n[-1] == "a" else 0.0005}
+                                           for n in one}, [levels[-1]])
+                          for one in (names[:1], names[1:], names))  # fmt: skip
+    assert large.score - none.score > 1.5 * hidden > 30 and both.score > large.score + 20 > small.score + 40
     left = [one.discrepancy for one in (large, small, both)]
     assert left[0].get("angle_a", 0.0) < 0.02 * none.discrepancy["angle_a"] < left[1]["angle_a"]
     assert "angle_b" in left[0] and "angle_b" not in left[1] and not left[2]
@@ -217,7 +194,6 @@ class Tipping:
     channels = {"angle": Channel("rad", "position")}  # noqa: RUF012
 
     def simulate(self, parameters, recording, start=None):
-        """The angle, by Runge and Kutta."""
         fall = lambda x: np.array([x[1], parameters["pull"] * np.sin(x[0])])  # noqa: E731
         x = np.array([start["angle"], start["angle_rate"]] if start else [0.01, 0.0])
         out = [x]
@@ -231,8 +207,7 @@ class Tipping:
 
 
 def test_a_start_that_says_much_of_what_follows_is_no_gap():
-    """About the start that the first samples show, a fall is far from linear; about where all put it, it is
-    not."""
+    """A fall is far from linear about the start that the first samples show alone."""
     t, logs = np.arange(0, 1, 0.01), []
     for seed in range(4):
         still = Recording("", t, {})
@@ -245,8 +220,7 @@ def test_a_start_that_says_much_of_what_follows_is_no_gap():
     white = covariances(model, linear).whitener()(linear.residual)
     search = Search(model, tuple(model.effects), model.rows.log)
     nothing = search.nothing()
-    assert np.mean(white**2) > 2
-    assert nothing.squares.mean() < 1.2 and not nothing.discrepancy
+    assert np.mean(white**2) > 2 and nothing.squares.mean() < 1.2 and not nothing.discrepancy
 
 
 def test_priors_are_cauchy_and_of_what_is_fitted_along_normal():

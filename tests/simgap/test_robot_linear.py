@@ -7,7 +7,7 @@ import pytest
 from simgap_swing import Swing, log
 
 from hmmseg.errors import InputError
-from hmmseg.io.task import BlockTask, SequenceTask, parse_task
+from hmmseg.io.task import SequenceTask, parse_task
 from simgap.channels import delayed, lowpass
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
@@ -35,16 +35,12 @@ def whitened(model: Composed, point=None, effects=()):
     return whiten(linear.residual), {n: whiten(m.jacobian) for n, m in linear.moved.items()}, linear
 
 
-def test_windows_tile_every_log_from_where_a_start_can_be_read():
+def test_windows_tile_every_log_and_run_across_no_gap():
     model = composed([log(0), log(1, seconds=2.05)])
     for number, recording in enumerate(model.recordings):
         mine = [w for w in model.windows if w.log == number]
         assert recording.t[mine[0].begin] - recording.t[0] == pytest.approx(REACH, abs=1e-3)
-        assert mine[-1].end == len(recording)
-        assert all(a.end == b.begin for a, b in itertools.pairwise(mine))
-
-
-def test_no_window_runs_across_a_gap_in_its_log():
+        assert mine[-1].end == len(recording) and all(a.end == b.begin for a, b in itertools.pairwise(mine))
     whole = log(0)
     kept = np.r_[0:150, 180:300, 304 : len(whole)]
     columns = {n: v[kept] for n, v in whole.columns.items()}
@@ -55,18 +51,14 @@ def test_no_window_runs_across_a_gap_in_its_log():
     assert np.mean(residual**2) < 1.3
 
 
-def test_a_start_is_right_within_what_it_says():
-    t = np.linspace(0, 1, 201)
-    off = []
+def test_starts_are_right_within_what_they_say_and_of_a_jerk_read_as_such():
+    t, off = np.linspace(0, 1, 201), []
     for seed in range(200):
         values = 0.3 * np.sin(5 * t) + 1e-3 * np.random.default_rng(seed).standard_normal(t.size)
         (value, sd), (rate, rate_sd) = smoothed(t, values, 80, 1e-3)
         off.append([(value - 0.3 * np.sin(2.0)) / sd, (rate - 1.5 * np.cos(2.0)) / rate_sd])
     # what is said is three times what white noise makes of it
     assert np.all(np.std(off, 0) < 0.45) and np.all(np.std(off, 0) > 0.2)
-
-
-def test_the_start_of_a_jerk_is_read_as_such():
     t = np.linspace(0, 1, 101)
     values = 300.0 * np.maximum(t - 0.485, 0.0) ** 3 + 1e-4 * np.random.default_rng(0).standard_normal(t.size)
     _, (rate, sd) = smoothed(t, values, 50, 1e-4)
@@ -76,12 +68,18 @@ def test_the_start_of_a_jerk_is_read_as_such():
     assert abs(np.polyfit(x, values[47:54], 2)[1] - true) > 3 * sd
 
 
-def test_whitened_residuals_of_a_true_model_are_white():
+def test_whitened_residuals_of_a_true_model_or_of_an_effect_at_its_value_are_white():
     model = composed([log(s) for s in range(4)])
     residual, _, linear = whitened(model)
     assert 0.9 < np.sqrt(np.mean(residual**2)) < 1.05
     inside = linear.rows.window[1:] == linear.rows.window[:-1]
     assert abs(np.mean((residual[1:] * residual[:-1])[inside])) < 0.06
+    recording = log(5)
+    late = delayed(recording.t - recording.t[0], recording["angle"], 0.01)
+    model = composed([recording.with_columns({"angle": late})])
+    nominal, _, _ = whitened(model)
+    there, _, _ = whitened(model, {"readout:angle.lag": {"delay": 0.01}})
+    assert np.mean(nominal**2) > 3 and np.mean(there**2) < 1.2
 
 
 @pytest.mark.parametrize(("effect", "values"), [
@@ -97,8 +95,7 @@ def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
     if made.model:
         planted = log(3, noise=1e-9, **values)
     elif made.command is not None:
-        acted = made.command(recording, values)
-        robot = Swing()
+        acted, robot = made.command(recording, values), Swing()
         nominal = {n: p["nominal"] for n, p in robot.parameters.items()}
         planted = recording.with_columns({"angle": robot.simulate(nominal, acted)["angle"]})
     else:
@@ -119,7 +116,6 @@ def test_a_large_misreading_moves_starts_farther_than_along_straight_lines(name)
     ((short, p),) = model.effects[name].parameters.items()
     there = {short: p.nominal + 4 * p.sd}
     one = vary(model, base, name, at=there)
-    assert one is not None
     np.testing.assert_allclose(one.shift, base_at(model, {name: there}).rows - base.rows, atol=1e-12)
 
 
@@ -136,22 +132,18 @@ def test_a_reading_s_past_is_undone_from_the_samples_that_are_there(name, value)
     assert np.isnan(undone[1::2]).all()
 
 
-def test_an_effect_at_its_value_leaves_noise_alone():
-    recording = log(5)
-    late = delayed(recording.t - recording.t[0], recording["angle"], 0.01)
-    model = composed([recording.with_columns({"angle": late})])
-    nominal, _, _ = whitened(model)
-    there, _, _ = whitened(model, {"readout:angle.lag": {"delay": 0.01}})
-    assert np.mean(nominal**2) > 3 and np.mean(there**2) < 1.2
-
-
-def test_lowpass_of_a_ramp_and_of_a_sine():
+def test_lowpass_resolution_and_noise_are_as_planted():
     t = np.linspace(0, 3, 3001)
     np.testing.assert_allclose(lowpass(t, 2 * t + 1, 0.1), 2 * (t - 0.1) + 1, atol=1e-12)
     w, tau = 2 * np.pi, 0.05
     found = lowpass(t, np.sin(w * t), tau)
     exact = np.imag(np.exp(1j * w * t) / (1 + 1j * w * tau))
     np.testing.assert_allclose(found[1000:], exact[1000:], atol=1e-5)
+    values = np.random.default_rng(0).standard_normal(500)
+    assert resolution(values) < 1e-4 and resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
+    log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
+    assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
+    assert estimate_noise([log.window(0, 2)], "z") == 1.0
 
 
 def test_what_only_acts_together_is_said():
@@ -165,12 +157,6 @@ def test_what_only_acts_together_is_said():
     assert any(a.own < 1e-3 and set(a.names) == set(names) for a in found.alike)
     kept = [k for k, n in enumerate(names) if n != "torque_scale"]
     assert not identifiability([names[k] for k in kept], columns[:, kept].T @ columns[:, kept]).alike
-
-
-def test_resolution_is_found_and_only_where_there_is_one():
-    values = np.random.default_rng(0).standard_normal(500)
-    assert resolution(values) < 1e-4
-    assert resolution(np.round(values / 0.01) * 0.01) == pytest.approx(0.01)
 
 
 def test_no_discrepancy_is_learned_from_a_true_model_and_one_from_a_false_one():
@@ -212,9 +198,8 @@ def test_numerics_are_exact_at_a_point_and_constant_about_it():
         near = pytest.approx(exact.moved[name].jacobian, rel=1e-6, abs=1e-9)
         assert linear.moved[name].jacobian == near
     doubled = linearise(made, point, ["step"]).moved["step"]
-    assert 0.5 * doubled.jacobian[:, 0] == pytest.approx(
-        0.01 * 0.5 * (made.rows.observed - exact.residual), rel=1e-3, abs=1e-9
-    )
+    assert 0.5 * doubled.jacobian[:, 0] == pytest.approx(0.01 * 0.5 * (made.rows.observed - exact.residual),
+                                                         rel=1e-3, abs=1e-9)  # fmt: skip
 
 
 @pytest.mark.parametrize("course", [lambda t: 0 * t, lambda t: -4.9 * t**2, lambda t: np.sin(3 * t)])
@@ -230,23 +215,14 @@ def test_noise_of_a_step_of_the_encoder_is_estimated(noise):
     """Of readings in steps a median of differences is a whole number of steps: 25 % too little."""
     t, rng = np.arange(6000) / 500, np.random.default_rng(0)
     read = 1e-4 * np.round(1e4 * np.sin(3 * t) + noise * rng.standard_normal(t.size))
-    wanted = 1e-4 * np.sqrt(noise**2 + 1 / 12)
-    log = Recording("log.csv", t, {"z": read})
+    wanted, log = 1e-4 * np.sqrt(noise**2 + 1 / 12), Recording("log.csv", t, {"z": read})
     assert estimate_noise([log], "z", 1e-4) == pytest.approx(wanted, rel=0.06)
 
 
-def test_a_log_too_short_for_a_difference_tells_none():
-    log = Recording("log.csv", np.arange(3) / 150, {"z": np.array([0.0, 1e-3, 0.0])})
-    assert estimate_noise([log], "z") == pytest.approx(1.4826 * 2e-3 / np.sqrt(6))
-    assert estimate_noise([log.window(0, 2)], "z") == 1.0
-
-
 def still_then_swinging(seed: int, begin: float):
-    """A pendulum at rest until its motor begins."""
     found = log(seed, seconds=6.0)
     torque = np.where(found.t < begin, 0.0, found["torque"])
-    empty = found.with_columns({"torque": torque})
-    robot = Swing()
+    empty, robot = found.with_columns({"torque": torque}), Swing()
     angle = robot.simulate({n: p["nominal"] for n, p in robot.parameters.items()}, empty)["angle"]
     noise = 5e-4 * np.random.default_rng(seed).standard_normal(angle.size)
     return empty.with_columns({"angle": angle + noise})
@@ -269,10 +245,8 @@ def test_a_task_names_the_phases_of_logs():
 
 def test_what_is_no_sequence_and_what_is_no_column_is_said():
     logs = [log(0)]
-    blocks = parse_task(
-        {"objects": {"block1": {"on": "ground"}}, "moves": [{"object": "block1", "to": "ground"}]}
-    )
-    assert isinstance(blocks, BlockTask)
+    blocks = parse_task({"objects": {"block1": {"on": "ground"}},
+                         "moves": [{"object": "block1", "to": "ground"}]})  # fmt: skip
     with pytest.raises(InputError, match="task of blocks"):
         phases_by_task(logs, blocks)
     with pytest.raises(InputError, match="no column force; expected torque, angle"):

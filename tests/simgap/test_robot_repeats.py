@@ -28,7 +28,6 @@ class Course:
     }
 
     def simulate(self, parameters, recording):
-        """At the recording's times."""
         return {"y": parameters["size"] * np.sin(3 * recording["pace"] * recording.t)}
 
 
@@ -64,17 +63,12 @@ def test_what_repeats_share_makes_an_interval_as_wide_as_one_log_would(repeats: 
     assert (0.8 < scatter < 1.2) if repeats else scatter > 2
 
 
-def test_logs_are_repeats_where_their_commands_are_alike():
-    rng = np.random.default_rng(0)
-    still = np.zeros((LOGS, T.size))
+def test_logs_are_repeats_where_commands_are_alike_and_count_each_where_the_model_is_right():
+    rng, still = np.random.default_rng(0), np.zeros((LOGS, T.size))
     made = composed(still, rng, [1.0, 1.0, 2.0, 1.0, 2.0, 1.0005, 3.0, 1.0])
-    assert made.motion == (0, 0, 1, 0, 1, 0, 2, 0)
-    assert made.repeats() == [5, 5, 2, 5, 2, 5, 1, 5]
+    assert made.motion == (0, 0, 1, 0, 1, 0, 2, 0) and made.repeats() == [5, 5, 2, 5, 2, 5, 1, 5]
     of_three = [k for k, w in enumerate(made.windows) if w.log in (0, 1, 6)]
     assert made.among(of_three).repeats() == [2, 2, 1]
-
-
-def test_where_the_model_is_right_repeats_count_each():
     rng = np.random.default_rng(1)
     made = composed(np.zeros((LOGS, T.size)), rng)
     linear = linearise(made, {}, ["size"])

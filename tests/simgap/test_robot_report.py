@@ -19,26 +19,19 @@ DEGREES = Own("rad", np.pi / 180, 0.0, "deg")
 
 
 def told(mean: float | None, sd: float = 0.01) -> dict:
-    """A parameter as a history keeps it."""
     ends = None if mean is None else [mean - 1.645 * sd, mean + 1.645 * sd]
     return {"mean": mean, "sd": sd, "interval_90": ends, "unit": "N m"}
 
 
-def test_a_history_says_within_moved_and_cannot_tell_since_when_it_was_known():
+def test_a_history_says_what_moved_and_that_no_more_often_than_stated():
     old = {"a": told(1.0), "b": told(1.0), "c": told(1.0), "d": told(1.0)}
-    past = [
-        {"date": "2026-01-01", "parameters": old},
-        {"date": "2026-02-01", "parameters": {"b": told(None)}},
-    ]
+    past = [{"date": "2026-01-01", "parameters": old},
+            {"date": "2026-02-01", "parameters": {"b": told(None)}}]  # fmt: skip
     now = {"a": told(1.01), "b": told(1.2), "c": told(1.025), "d": told(None), "new": told(1.0)}
     found = compared(past, now)
-    assert {n: v["says"] for n, v in found.items()} == {
-        "a": "within", "b": "moved", "c": "cannot tell", "d": "cannot tell",
-    }  # fmt: skip
+    assert {n: v["says"] for n, v in found.items()} == {"a": "within", "b": "moved", "c": "cannot tell",
+                                                        "d": "cannot tell"}  # fmt: skip
     assert found["b"]["since"] == "2026-01-01" and found["b"]["then"] == 1.0
-
-
-def test_nothing_moves_more_often_than_stated():
     rng = np.random.default_rng(0)
     runs = [{n: told(float(rng.normal(1, 0.01))) for n in "abcde"} for _ in range(801)]
     pairs = zip(runs[:-1:2], runs[1::2], strict=True)
@@ -61,25 +54,24 @@ def test_a_history_that_is_none_names_its_line(tmp_path, line):
         history(file)
 
 
-def test_what_was_named_stands_over_what_was_calibrated_and_of_a_set_nothing_is_told():
-    body = {
-        "verdict": "named", "causes": ["joint:a.f"], "indistinguishable": [],
-        "effects": {"joint:a.f": {"parameters": {"f": told(2.0)}},
-                    "s": {"parameters": {"v": told(1.0), "w": told(4.0)}}},
-        "calibrated": {"parameters": {"joint:a.f": told(1.0), "g": told(3.0)}},
-    }  # fmt: skip
+def test_what_was_named_stands_over_what_was_calibrated_and_a_model_that_flies_off_is_a_line():
+    body = {"verdict": "named", "causes": ["joint:a.f"], "indistinguishable": [],
+            "effects": {"joint:a.f": {"parameters": {"f": told(2.0)}},
+                        "s": {"parameters": {"v": told(1.0), "w": told(4.0)}}},
+            "calibrated": {"parameters": {"joint:a.f": told(1.0), "g": told(3.0)}}}  # fmt: skip
     assert {n: p["mean"] for n, p in intervals(body).items()} == {"joint:a.f": 2.0, "g": 3.0}
     found = intervals(body | {"verdict": "set", "indistinguishable": ["s"]})
     assert {n: p["mean"] for n, p in found.items()} == {"joint:a.f": None, "g": 3.0, "s.v": None, "s.w": None}
+    with (Output("diagnose", quiet=True) as out,
+          pytest.raises(InputError, match="runs far away from the logs"),
+          show_stages(out, "diagnosing", 1)):  # fmt: skip
+        np.linalg.cholesky(-np.eye(2))
 
 
-def test_a_motion_is_written_as_its_log_has_it():
+def test_motions_are_written_as_logs_have_them_and_pages_in_their_units():
     log = Recording("a.csv", np.array([2.0, 2.5]), {"u": np.array([0.0, np.pi / 2]), "v": np.ones(2)})
     text = motion_csv(log, ["u", "v"], {"u": DEGREES}, ("stamp_ms", 1e-3))
     assert text == "stamp_ms,u,v\n0,0,1\n500,90,1\n"
-
-
-def test_a_page_says_a_value_in_its_columns_unit_and_a_loads_place():
     bias = {"mean": np.pi / 180, "sd": 1e-4, "interval_90": [0.017, 0.018], "unit": "rad", "nominal": 0.0}
     setting = Setting([], own={"q1": DEGREES})
     ((_, model, found, ends),) = _parameters({"parameters": {"bias": bias}}, ["readout:q1.bias"], setting)
@@ -97,25 +89,14 @@ def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
         save=lambda path: None, flush=lambda: None,
         send_columns=lambda entity, indexes, columns: sent.append((entity, *indexes, columns)),
     )  # fmt: skip
-    fake = SimpleNamespace(
-        RecordingStream=lambda name: stream, TimeColumn=lambda name, duration: duration,
-        Scalars=SimpleNamespace(columns=lambda scalars: scalars),
-    )  # fmt: skip
+    fake = SimpleNamespace(RecordingStream=lambda name: stream, TimeColumn=lambda name, duration: duration,
+                           Scalars=SimpleNamespace(columns=lambda scalars: scalars))  # fmt: skip
     monkeypatch.setitem(sys.modules, "rerun", fake)
     t = np.array([0.0, np.nan, 1.0])
     write_rerun(tmp_path / "a.rrd", [Course("a.csv", "q", "deg", t, t, t + 1, t + 2, 1.0)])
     assert [e for e, *_ in sent] == [f"a.csv/q/{n}" for n in ("recorded", "simulated", "corrected")]
     assert [list(v) for _, _, v in sent] == [[0, 1], [1, 2], [2, 3]]
     assert all(list(index) == [0, 1] for _, index, _ in sent)
-
-
-def test_a_model_that_flies_off_is_one_line():
-    with (
-        Output("diagnose", quiet=True) as out,
-        pytest.raises(InputError, match="runs far away from the logs"),
-        show_stages(out, "diagnosing", 1),
-    ):
-        np.linalg.cholesky(-np.eye(2))
 
 
 @pytest.mark.parametrize(("options", "line"), [
@@ -127,5 +108,4 @@ def test_options_that_cannot_be_are_said_at_once(tmp_path, capsys, options, line
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "rerun", None)
     (tmp_path / "a.csv").write_text(json.dumps("t"))
-    assert main(["diagnose", "a.csv", *options]) == 2
-    assert line in capsys.readouterr().err
+    assert main(["diagnose", "a.csv", *options]) == 2 and line in capsys.readouterr().err

@@ -19,7 +19,6 @@ NAMES = ("a", "b", "c")
 
 
 def sets_of(columns: np.ndarray, residual: np.ndarray, fold: np.ndarray, low: float = -np.inf) -> Sets:
-    """One thing fitted along, then three candidates of one parameter, white noise."""
     each = [c for k in (1, 2, 3) for c in (0 * residual, columns[:, k])]
     whole = np.column_stack([residual, columns[:, 0], *each])
     gram = np.array([[whole[fold == n].T @ whole[fold == n] for n in np.unique(fold)]])
@@ -97,8 +96,7 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
     found = cov.estimate(rows)
     assert {*found} == {"p"} and found["p"] == pytest.approx(0.7, rel=0.2)
     white = cov.whitener(found)(rows)
-    assert np.mean(white**2) == pytest.approx(1.0, rel=0.1)
-    assert cov.outliers(cov.whitener(found), rows) == {}
+    assert np.mean(white**2) == pytest.approx(1.0, rel=0.1) and cov.outliers(cov.whitener(found), rows) == {}
     rows[160:240] *= 3.0
     wide = cov.outliers(cov.whitener(cov.estimate(rows)), rows)
     assert {*wide} == {2} and wide[2] == pytest.approx(9.0, rel=0.4)
@@ -108,7 +106,7 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
     assert cov.estimate(rows, wide, {}) == {}
 
 
-def test_what_shows_in_every_window_is_no_windows_own():
+def test_what_shows_in_every_window_is_no_windows_own_and_the_likelihood_has_its_gradient():
     rng, cov, left = np.random.default_rng(1), Covariances(tuple(block(k) for k in range(30))), {"p": 2.0}
     each = [np.linalg.cholesky(b.covariance(left)) @ rng.standard_normal(80) for b in cov.blocks]
     linear, whiten = SimpleNamespace(residual=np.concatenate(each)), cov.whitener(left)
@@ -118,9 +116,6 @@ def test_what_shows_in_every_window_is_no_windows_own():
     worse = sum(density(b, {}, r) - density(b, left, r) for b, r in both)
     assert _score_of_noise(one) == pytest.approx(7.0 + worse)  # type: ignore[arg-type]
     assert len(cov.outliers(cov.whitener(), linear.residual)) > 15
-
-
-def test_the_gradient_of_the_likelihood_is_its_slope():
     smooth = Covariances(tuple(block(k) for k in range(3)))._smooth
     left, x = np.random.default_rng(2).standard_normal(smooth.plain.shape[:2]), np.array([-0.5, 0.3])
     rest = np.random.default_rng(5).standard_normal(smooth.share.size)
@@ -131,22 +126,31 @@ def test_the_gradient_of_the_likelihood_is_its_slope():
         assert slope[k] == pytest.approx(change / 2e-5, rel=1e-5)
 
 
-def test_noise_leaves_the_floor():
+def test_starts_are_taken_from_residuals_and_noise_leaves_the_floor():
     rng, cov = np.random.default_rng(3), Covariances((block(0),))
     one, sensor = cov.blocks[0], cov.whitener()
     noise = np.sqrt(one.variance)[:, None] * rng.standard_normal((80, 2000))
     left = np.sum(sensor(noise + one.start @ rng.standard_normal((2, 2000)) / 3) ** 2, 0)
     assert cov.floor() == pytest.approx(np.mean(left), rel=0.02)
+    rng, cov = np.random.default_rng(3), Covariances(tuple(block(k) for k in range(4)))
+    noise = np.sqrt(0.5) * rng.standard_normal(320)
+    moved = np.concatenate([b.start @ rng.standard_normal(2) for b in cov.blocks])
+    left = cov.without_starts(cov.whitener(), noise + moved)
+    assert (np.mean(left**2) == pytest.approx(np.mean(noise**2), rel=0.1)
+            and np.mean((noise + moved) ** 2) > 1.5)  # fmt: skip
+    assert np.isnan(cov.without_starts(cov.whitener(), np.where(moved > 9, moved, np.nan))).all()
 
 
-def test_a_value_at_a_bound_is_doubted_but_for_nothing_at_all():
-    known = {
-        "rubs": RobotEffect("rubs", "", {"loss": Parameter(0.02, 0.01, "N m", low=0.0)}),
-        "weighs": RobotEffect("weighs", "", {"mass": Parameter(1.0, 0.1, "kg", low=0.3)}),
-    }
+def test_values_at_bounds_and_logs_that_disagree_are_doubted():
+    known = {"rubs": RobotEffect("rubs", "", {"loss": Parameter(0.02, 0.01, "N m", low=0.0)}),
+             "weighs": RobotEffect("weighs", "", {"mass": Parameter(1.0, 0.1, "kg", low=0.3)})}  # fmt: skip
     best = SimpleNamespace(point={"rubs": {"loss": 0.0}, "weighs": {"mass": 0.3}})
     assert _absurd(known, best, ["rubs"]) == ()  # type: ignore[arg-type]
     assert _absurd(known, best, ["rubs", "weighs"]) == ("weighs mass 0.3 kg is no value of a robot's",)  # type: ignore[arg-type]
+    assert predicts_better(np.array([0.5, 0.6, 0.5, 0.4, 0.5, 0.6]))  # little, but in every log
+    assert predicts_better(np.array([9.0, 370.0, 21.0]))  # much, and in one log far more
+    assert not predicts_better(np.array([0.3, 37.0, -8.7]))  # one log is predicted worse
+    assert not predicts_better(np.array([0.3, 370.0, 0.2]))  # one log alone says so
 
 
 @pytest.mark.parametrize("folds", [2, 3, 6])
@@ -155,13 +159,6 @@ def test_a_set_predicts_better_by_chance_as_rarely_as_it_says(folds: int, sd: fl
     # of two normal densities that are sd apart, the log ratio where the rival is right
     gains = np.random.default_rng(0).normal(-0.5 * sd**2, sd, (4000, folds))
     assert np.mean([predicts_better(g) for g in gains]) < 0.06
-
-
-def test_a_set_predicts_better_only_where_logs_agree():
-    assert predicts_better(np.array([0.5, 0.6, 0.5, 0.4, 0.5, 0.6]))  # little, but in every log
-    assert predicts_better(np.array([9.0, 370.0, 21.0]))  # much, and in one log far more
-    assert not predicts_better(np.array([0.3, 37.0, -8.7]))  # one log is predicted worse
-    assert not predicts_better(np.array([0.3, 370.0, 0.2]))  # one log alone says so
 
 
 def test_log_odds_count_less_where_residuals_vary_more_than_their_discrepancy():
@@ -183,26 +180,10 @@ def test_log_odds_count_less_where_residuals_vary_more_than_their_discrepancy():
 
 
 def test_what_replaces_a_cause_is_told_although_it_could_replace_a_small_effect_too():
-    sets = [
-        SimpleNamespace(names=names, score=score)
-        for names, score in [(("load", "hold", "hum"), 0.0), (("load", "hold", "lag"), -1.0),
-                             (("load", "lag", "hum"), -9.0), (("load", "gain", "lag"), -9.0)]
-    ]  # fmt: skip
+    sets = [SimpleNamespace(names=names, score=score)
+            for names, score in [(("load", "hold", "hum"), 0.0), (("load", "hold", "lag"), -1.0),
+                                 (("load", "lag", "hum"), -9.0),
+                                 (("load", "gain", "lag"), -9.0)]]  # fmt: skip
     found = _explanations(sets[1:], sets[0], ("hold", "load"), {"hum", "lag"}, 1.0)  # type: ignore[arg-type]
-    assert [one.causes for one in found] == [
-        ("hold", "load"),
-        ("hold", "load"),
-        ("lag", "load"),
-        ("gain", "load"),
-    ]
-
-
-def test_what_starts_make_of_a_residual_is_taken_from_it():
-    rng, cov = np.random.default_rng(3), Covariances(tuple(block(k) for k in range(4)))
-    noise = np.sqrt(0.5) * rng.standard_normal(320)
-    moved = np.concatenate([b.start @ rng.standard_normal(2) for b in cov.blocks])
-    left = cov.without_starts(cov.whitener(), noise + moved)
-    assert (
-        np.mean(left**2) == pytest.approx(np.mean(noise**2), rel=0.1) and np.mean((noise + moved) ** 2) > 1.5
-    )
-    assert np.isnan(cov.without_starts(cov.whitener(), np.where(moved > 9, moved, np.nan))).all()
+    assert [one.causes for one in found] == [("hold", "load"), ("hold", "load"), ("lag", "load"),
+                                             ("gain", "load")]  # fmt: skip

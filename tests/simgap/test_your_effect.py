@@ -1,5 +1,6 @@
-"""An effect is one file: that of docs/your_effect.md is a candidate of hands, robots, ensembles and play."""
+"""An effect is one file, named nowhere else: that of docs/your_effect.md is a candidate everywhere."""
 
+import ast
 import re
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import simgap
 from experiments.generic_ensembles import TASK, ensemble
 from hmmseg.io.trial import Trial
 from simgap import channels, effects
+from simgap.effects import catalogue
 from simgap.generic import effects as of_ensembles
 from simgap.generic.diagnose import diagnose
 from simgap.generic.trials import align
@@ -22,6 +24,9 @@ from simgap.robot_effects.base import Setting
 from simgap.simulators.user import checked
 
 PAGE = Path(simgap.__file__).parents[1] / "docs" / "your_effect.md"
+ROOT = Path(simgap.__file__).parent
+# The comparison with given trials and robots have effects of their own, some of the same names.
+CATALOGUES = {ROOT / "generic/effects.py", ROOT / "channels/drives.py"}
 
 
 @pytest.fixture
@@ -37,7 +42,7 @@ def step(tmp_path, monkeypatch):
         cache.cache_clear()
 
 
-def test_it_is_a_candidate_everywhere(step):
+def test_it_is_a_candidate_everywhere_and_taken_out_of_forces_as_it_was_put_in(step):
     mine = effects.catalogue()["force_step"]
     assert list(mine.parameters) == ["fx1", "fy1", "fx2", "fy2"] and "force_step" in felt_effects()
     assert mine.parameters["fx1"].unit == "N" and mine.parameters["fx1"].sd == pytest.approx(0.09)
@@ -45,16 +50,6 @@ def test_it_is_a_candidate_everywhere(step):
     robots = candidates(Setting(checked(Swing(), "Swing"), logs))["readout:angle.step"]
     sd = np.concatenate([r["angle"] for r in logs]).std()
     assert robots.parameters["step"].sd == pytest.approx(0.03 * sd)
-
-
-class Few(NamedTuple):
-    """Of a performance and of a world what a reading needs."""
-
-    t: np.ndarray
-    force: np.ndarray
-
-
-def test_it_is_taken_out_of_a_hand_s_forces_as_it_was_put_in(step):
     mine, t = effects.catalogue()["force_step"], np.linspace(0, 4, 60)
     truth = np.random.default_rng(0).standard_normal((60, 4))
     values = {"fx1": 0.1, "fy1": -0.2, "fx2": 0.0, "fy2": 0.3}
@@ -64,13 +59,38 @@ def test_it_is_taken_out_of_a_hand_s_forces_as_it_was_put_in(step):
     np.testing.assert_allclose(out.force[0], truth, atol=1e-12)
 
 
+class Few(NamedTuple):
+    """Of a performance and of a world what a reading needs."""
+
+    t: np.ndarray
+    force: np.ndarray
+
+
 def test_it_is_named_in_given_trials(step):
     rng = np.random.default_rng(3)
     real, first = ensemble(rng, 6)
     sim, second = ensemble(rng, 6, name="sim")
-    changed = [
-        Trial(t.file, t.t, t.channels | {"fa": step.read(t.t, t.channels["fa"], {"step": 1.0})}) for t in real
-    ]
+    changed = [Trial(t.file, t.t, t.channels | {"fa": step.read(t.t, t.channels["fa"], {"step": 1.0})})
+               for t in real]  # fmt: skip
     body = diagnose(align(changed, sim, TASK, boundaries=first | second)).body
     assert body["causes"] == ["force_step"]
     assert body["effects"]["force_step"]["parameters"]["fa"]["mean"] == pytest.approx(1.0, rel=0.1)
+
+
+def named_in(path: Path, names: set[str]) -> set[str]:
+    """Effects whose names stand as strings in the code of a file, alone or before what follows a dot."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    texts = (n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str))
+    found = [text for text in texts if not text.endswith(".toml")]  # actual.toml is a file
+    return {text.split(".")[0].split("/")[0] for text in found} & names
+
+
+def test_no_file_but_those_that_define_effects_names_one():
+    names, listed = set(catalogue()), {}
+    for path in sorted(ROOT.rglob("*.py")):
+        # What an effect is taken for, and its own keys, are said where it is defined.
+        own = path.parent == ROOT / "effects" and " = HandEffect(\n" in path.read_text(encoding="utf-8")
+        others = set() if own or path in CATALOGUES else named_in(path, names)
+        if others:
+            listed[str(path.relative_to(ROOT))] = others
+    assert listed == {}
