@@ -38,9 +38,8 @@ def test_processes_say_one_line_of_bad_input_and_show_the_traceback_of_a_bug(tmp
     assert done.stderr.count("\n") == 1 and os.listdir(tmp_path) == ["bad.toml"]
     code = """if True:
         import sys
-        import hmmseg.contact.decompose
-        from hmmseg_cli import main
-        hmmseg.contact.decompose.decompose = lambda task: 1 / 0
+        from hmmseg_cli import describe, main
+        describe.decompose_task = lambda task: 1 / 0
         sys.exit(main.main(["decompose", sys.argv[1]]))
     """
     (tmp_path / "good.toml").write_text(TASK)
