@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from hmmseg.errors import nearest
 from hmmseg.io.schema import LARGEST, Deviation, Finite, FinitePositive, Name, Positive, StrictTable
@@ -30,6 +30,13 @@ def _by_axis(value: Any) -> Any:
 
 def _several(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
+
+
+def _counted(names: tuple[str, ...], counts: tuple[int, ...], expected: str) -> tuple[str, ...]:
+    """Names of columns, of which there must be as many as one of `counts`; ValueError otherwise."""
+    if len(names) not in counts:
+        raise ValueError(f"has {len(names)} columns; expected {expected}")
+    return names
 
 
 ByAxis = Annotated[dict[Axis, Name], BeforeValidator(_by_axis)]
@@ -58,15 +65,15 @@ class Gripper(StrictTable):
     motor_current: Name | None = None  # [A], which times `force_per_ampere` [N/A] is the grip force
     force_per_ampere: FinitePositive | None = None
 
-    @field_validator("wrench", "opening")
+    @field_validator("wrench")
     @classmethod
-    def _counted(cls, names: tuple[str, ...], of: ValidationInfo) -> tuple[str, ...]:
-        counts, expected = (1, 2), "one, or one for each finger"
-        if of.field_name == "wrench":
-            counts, expected = (3, 6), "3 forces, or 3 forces and 3 torques"
-        if len(names) not in counts:
-            raise ValueError(f"has {len(names)} columns; expected {expected}")
-        return names
+    def _whole(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return _counted(names, (3, 6), "3 forces, or 3 forces and 3 torques")
+
+    @field_validator("opening")
+    @classmethod
+    def _of_fingers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return _counted(names, (1, 2), "one, or one for each finger")
 
     @field_validator("sensor_axes")
     @classmethod

@@ -5,7 +5,7 @@ import re
 import tomllib
 import typing
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -30,13 +30,16 @@ DEEPEST = 32  # limit: parts of a dotted key
 SEPARATOR, JOINT = re.compile(r"[=,{}\[\]\n]"), re.compile(r"[\w\"'-]\s*\.(?=\s*[\w\"'-])")
 
 
+T = TypeVar("T", bound="StrictTable")
+
+
 class StrictTable(BaseModel):
     """A frozen table that refuses keys it does not know."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
 
     @classmethod
-    def validated(cls, table: dict[str, Any], where: str) -> Self:
+    def validated(cls: type[T], table: dict[str, Any], where: str) -> T:
         """The table as this model; InputError names the key at fault and the nearest known one."""
         try:
             return cls.model_validate(table)
@@ -55,7 +58,7 @@ class StrictTable(BaseModel):
         raise InputError(f"{where}: key {key}" if key else where, problem)
 
     @classmethod
-    def from_toml(cls, path: str | Path) -> Self:
+    def from_toml(cls: type[T], path: str | Path) -> T:
         """The same from a TOML file; InputError as well if it cannot be read."""
         return cls.validated(read_toml(path), str(path))
 

@@ -341,7 +341,8 @@ class Search:
             score += 0.5 * float(np.linalg.slogdet(fit.covariance[np.ix_(inside, inside)])[1])
             score += _prior_constants(sets.size)
             score += len(wide) * ALONE - 1e3 * linear.dropped
-        return FittedSet(composed, names, point, linear, cov, discrepancy, wide, whiten, sets, score, promise)
+        return FittedSet(composed, names, point, linear, cov, discrepancy, wide, whiten, sets, float(score),
+                         float(promise))  # fmt: skip
 
     def _sets(self, linear: Linear, levels: Sequence[Whitener], names: Sequence[str]) -> Sets:
         """The closed form for those of some candidates that did not diverge."""
