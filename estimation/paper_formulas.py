@@ -64,9 +64,21 @@ def estimate_plugin(
     trials_signals: Sequence[Signals], segmentations: Sequence[Segmentation], task: BlockTask,
     states: Sequence[StateLabels] | None = None,
 ) -> tuple[Properties, dict[str, str]]:  # fmt: skip
-    """The paper's estimates of every object of a task from segmented trials: entries as in identify's JSON
-    with `standard_error` and normal intervals, and the reason for each missing one by `object.property`.
-    `states`: contact states of each trial's samples, by default those of the paper's thresholds."""
+    """The paper's estimates of every object of a task from its segmented trials.
+
+    Args:
+        trials_signals: one per trial.
+        segmentations: one per trial.
+        task: of all trials.
+        states: contact states of each trial's samples; by default those of the paper's thresholds.
+
+    Returns:
+        Every property's entry in identify's JSON, with its `standard_error` and normal intervals; and the
+        reason for each missing one, by `object.property`.
+
+    Raises:
+        ValueError: the sequences differ in length.
+    """
     labels = [label_states(s) for s in trials_signals] if states is None else states
     task = _as_performed(task, segmentations)
     steps = subtasks(task)

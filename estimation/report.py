@@ -67,9 +67,18 @@ def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "ac
 
 
 def compare(properties: dict[str, Any], measured: Actual, smallest: float = 0.0) -> dict[str, Any]:
-    """By object and property of `measured`: `value`, `sd`, and if identified `relative_deviation`, `z` (in
-    sds of both combined), `inside_95` and `disagrees` (beyond SURE sds and the relative deviation
-    `smallest`). A friction with only a lower bound disagrees if the measured value lies below it."""
+    """Compare identified properties with measured values.
+
+    Args:
+        properties: as in identify's JSON.
+        measured: value and standard deviation by object and property.
+        smallest: relative deviation that matters.
+
+    Returns:
+        By object and property: `value`, `sd`, and if the property was identified `relative_deviation`, `z`
+        (in sds of both combined), `inside_95` and `disagrees` (beyond SURE sds and beyond `smallest`). A
+        friction with only a lower bound disagrees if the measured value lies below it.
+    """
     out: dict[str, Any] = {}
     for obj, entries in measured.items():
         for prop, (value, sd) in entries.items():

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from estimation.identification import Identification
-from estimation.report import Actual, parse_actual, read_actual
+from estimation.report import parse_actual, read_actual
 from hmmseg.api import Source, align, block_task
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
@@ -60,7 +60,7 @@ def diagnose(
     trials: Source | Sequence[Source] | AlignedTrials | Identification,
     task: Source = None,
     rig: Source = None,
-    actual: str | Path | Actual | None = None,
+    actual: str | Path | dict[str, Any] | None = None,
     effects: Sequence[str] = (),
     healthy: Source | Sequence[Source] | AlignedTrials | None = None,
     seed: int = 0,

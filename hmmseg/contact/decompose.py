@@ -369,8 +369,17 @@ VARYING_LOAD = "the vertical force must vary while the object slides"
 
 
 def height_equations(task: BlockTask) -> list[tuple[int, dict[str, int]]]:
-    """For each performed move its 0-based index and the rise of its object's bottom, as a sum {object:
-    coefficient} of object heights; {} for a slide. The paper's Table 3 has one coefficient."""
+    """For each performed move, the rise of its object's bottom as a sum of object heights.
+
+    The paper's height of the block beneath (its Table 3) is the case of a single coefficient.
+
+    Args:
+        task: of blocks.
+
+    Returns:
+        (0-based index of the move, {object: coefficient}) per move: bottom height at place less that
+        at pickup. The rise of a slide is {}.
+    """
     held, equations = [step for step in subtasks(task) if step.state != FREE], []
     for move, (start, end) in enumerate(zip(held[::3], held[2::3], strict=True)):
         rise = {name: (name in end.beneath) - (name in start.beneath) for name in task.objects}

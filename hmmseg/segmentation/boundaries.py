@@ -34,7 +34,8 @@ LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain 
 MOTION, MOTIONS = (0.05, 1.0), 16  # prior: s; duration of the motion that an impact ends: log-uniform
 STARTS = 48  # numerics: nodes over the time at which that motion started
 SHAPE = 0.05  # prior: relative deviation of its speed from the minimum-jerk profile
-STOP = 0.01  # prior: s; time constant with which an impact stops the motion
+# prior: s; time constant with which an impact stops the motion: sqrt(m / k) of 0.1 to 0.3 kg on 1 to 3 N/mm
+STOP = 0.01
 REBOUND = 0.7  # prior: relative deviation of the way that this takes, as a hand that hits fast rebounds
 SPEEDS = np.linspace(-3.0, 3.0, 13)  # numerics: nodes of a normal distribution of speeds, in its sd
 

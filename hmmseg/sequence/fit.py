@@ -51,8 +51,19 @@ ENOUGH = 2  # numerics: fully labelled trials for boundary templates: one is lef
 
 
 def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | None = None) -> SequenceModel:
-    """Learn emissions and durations of a plain ordered task from trials, labelled (as `read_labels` takes it)
-    or not; InputError for trials too short for it, missing channels or labels that do not fit."""
+    """Learn emissions and durations of a plain ordered task.
+
+    Args:
+        trials: recordings, labelled or not; unlabelled ones contribute too.
+        task: the order of the subtasks.
+        labels: as `read_labels` takes them; None of no trial.
+
+    Returns:
+        The fitted model.
+
+    Raises:
+        InputError: trials too short for the task, missing channels or labels that do not fit.
+    """
     if not trials:
         raise InputError("trials", "none given", "at least one trial")
     channels = task.channels or tuple(n for n in trials[0].channels if all(n in t.channels for t in trials))
@@ -71,9 +82,22 @@ def fit_sequence(trials: Sequence[Trial], task: SequenceTask, labels: Labels | N
 
 
 def read_labels(trials: Sequence[Trial], task: SequenceTask, labels: Labels) -> list[np.ndarray]:
-    """Known boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown, from an entry for each or by
-    name, or a folder or table for `label_files`. An entry holds boundaries, None where unknown, or {subtask:
-    its start}; a skipped subtask has two equal ones. InputError if they do not fit."""
+    """Known boundaries of each trial.
+
+    Args:
+        trials: recordings of the task.
+        task: the order of the subtasks.
+        labels: one entry for each trial, or entries by the trials' names (with or without suffix), or a
+            folder or table for `label_files`. An entry holds boundaries [s], one fewer than subtasks, None
+            where unknown, or {subtask: its start}; a skipped optional subtask has two equal ones. None: no
+            label.
+
+    Returns:
+        Boundaries (num_subtasks - 1,) [s] of each trial, NaN where unknown.
+
+    Raises:
+        InputError: labels that are none of these trials', or do not fit the task.
+    """
     if isinstance(labels, str | Path):
         labels = label_files(Path(labels), trials)
     if isinstance(labels, Mapping):
@@ -99,9 +123,19 @@ def _is_named(name: str, trial: Trial) -> bool:
 
 
 def label_files(where: Path, trials: Sequence[Trial]) -> dict[str, Any]:
-    """Entries for `read_labels` by the trials' names, from a folder with NAME.json, {"boundaries": [s or
-    null, ...]}, or a table (CSV, TSV) with columns trial, subtask and start [s]; InputError if there is
-    none."""
+    """Labels by trial, from a folder or a table.
+
+    Args:
+        where: a folder with NAME.json for some of the trials, {"boundaries": [times in s, null where
+            unknown]}, or a table (CSV, TSV in any dialect) with the columns trial, subtask and start [s].
+        trials: the trials.
+
+    Returns:
+        Entries for `read_labels` by the trials' names.
+
+    Raises:
+        InputError: there are no labels, they cannot be read, or they are of other trials.
+    """
     if where.is_dir():
         files = {trial.name: where / f"{trial.stem}.json" for trial in trials}
         out = {name: _boundaries(path) for name, path in files.items() if path.exists()}

@@ -97,8 +97,14 @@ class SequenceModel(Tabled):
         return align([ll], [chain])[0]
 
     def misfit(self, trial: SequenceFeatures) -> tuple[np.ndarray, np.ndarray, AlignmentPosterior]:
-        """How badly a trial fits without boundary templates: log evidence of free switching over forced order
-        [nats], minus log evidence per cell (2,); log-likelihoods; alignment. Unlabelled, it is coarsened."""
+        """How badly a trial fits, without boundary templates, which free switching has no counterpart of.
+
+        Evidence of models learned without labels is coarsened (`hmmseg.sequence.courses`).
+
+        Returns:
+            (2,) log evidence of free switching over forced order [nats], and minus log evidence per cell;
+            the log-likelihoods (num_cells, num_states); the alignment.
+        """
         model, temper = replace(self, detectors=None), self.emissions.temper
         if self.detectors is None:
             temper *= INDEPENDENT / (INDEPENDENT + temper * trial.values.size)
@@ -185,7 +191,18 @@ def save_model(model: SequenceModel, path: str | Path) -> None:
 
 
 def load_model(path: str | Path, task: SequenceTask) -> SequenceModel:
-    """Read what `save_model` wrote; InputError if it is no model, or was learned for another task."""
+    """Read a model.
+
+    Args:
+        path: a file written by `save_model`.
+        task: the task for which it was learned.
+
+    Returns:
+        The model.
+
+    Raises:
+        InputError: the file is no model, or was learned for another task.
+    """
     where, expected = str(path), "a model written by `hmmseg fit`"
     try:
         table = unpack(Path(path))

@@ -92,9 +92,21 @@ _Boundary = tuple[float, float, tuple[float, float]]  # median, sd, 90 % interva
 
 def segment_sequence(trials: Sequence[Trial], task: SequenceTask,
                      model: SequenceModel | None = None) -> list[Segmentation]:  # fmt: skip
-    """Segment recordings of a plain ordered task, by a model of `fit_sequence` or one learned from these
-    trials. A skipped optional subtask has no span; where trials can be read in several ways, spans have
-    `alternatives` and a segmentation a `question`. InputError if trials, task and model do not fit."""
+    """Segment recordings of a plain ordered task.
+
+    Args:
+        trials: recordings.
+        task: the order of the subtasks.
+        model: from `fit_sequence`; by default learned from these trials themselves.
+
+    Returns:
+        One segmentation a trial. A trial that does not follow the task says so in `failed` and keeps its
+        spans. A skipped optional subtask has no span. Where trials can be read in several ways, spans have
+        `alternatives` and the segmentation a `question`.
+
+    Raises:
+        InputError: trials, task and model do not go together.
+    """
     if model is None:
         model = fit_sequence(trials, task)
     elif model.task.sequence != task.sequence:

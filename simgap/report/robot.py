@@ -143,7 +143,11 @@ class _Run(BaseModel):
 
 
 def history(path: Path) -> list[dict[str, Any]]:
-    """The runs in a history file, one line of JSON each, none without a file; InputError if one is no run."""
+    """The runs in a history file, one line of JSON each; none if there is no file.
+
+    Raises:
+        InputError: A line is not a run.
+    """
     if not path.exists():
         return []
     out = []
@@ -183,7 +187,11 @@ def compared(
 
 
 def write_rerun(path: Path, found: Sequence[Course]) -> None:
-    """Write the courses of all logs and channels for Rerun's viewer; InputError without rerun-sdk."""
+    """Write recorded, simulated and corrected courses of all logs and channels for Rerun's viewer.
+
+    Raises:
+        InputError: rerun-sdk is not installed.
+    """
     try:
         rerun: Any = importlib.import_module("rerun")
     except ImportError:

@@ -51,10 +51,24 @@ def read_recording(
     path: Path, wanted: Iterable[str], times: str = "t", unit: float = 1.0, commands: Collection[str] = (),
     acts: str | None = None,
 ) -> Recording:  # fmt: skip
-    """Read the columns `wanted` from a file of any kind. Columns at rates of their own are brought to the
-    rows of the fastest, `commands` as held from sample to sample; `unit` [s] is that of the column `times`.
-    `acts`: name of a column to add of the times [s] from which commands acted, where these differ. InputError
-    for a column that is missing or no number, or a clock that goes back or has another unit."""
+    """Read the columns that a simulator needs from a file of any kind.
+
+    Columns that come at rates of their own, in rows of their own, are brought to the rows of the fastest.
+
+    Args:
+        path: The file.
+        wanted: Names of its columns.
+        times: The column of times.
+        unit: Its unit [s].
+        commands: Columns that are held from sample to sample.
+        acts: Name of a column to add where rows differ in when their commands were given: these times [s].
+
+    Returns:
+        The recording.
+
+    Raises:
+        InputError: A column is missing, a cell is no number, or the clock goes back or has another unit.
+    """
     names = tuple(dict.fromkeys(wanted))
     ours = {n: OTHER if n == "t" != times else n for n in names}
     given = {"t": Column.model_validate({"from": times, "unit": unit})}

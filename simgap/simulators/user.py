@@ -50,8 +50,18 @@ class UserSimulator:
 
 
 def load_simulator(spec: str) -> UserSimulator:
-    """Load the simulator `FILE.py:NAME`, an object, a class (made without arguments) or a function with
-    attributes, all calls checked; InputError if it is missing, fails, or declares what cannot be used."""
+    """Load a simulator from a user's Python file.
+
+    Args:
+        spec: `FILE.py:NAME`; the name is of an object, a class (made without arguments) or a function with
+            attributes `parameters` and `channels`.
+
+    Returns:
+        The simulator, with all calls checked.
+
+    Raises:
+        InputError: The file or the name is missing, its code fails, or what it declares cannot be used.
+    """
     file, _, name = spec.rpartition(":")
     where = f"--simulator {spec}"
     if not file or not name.isidentifier():

@@ -81,7 +81,17 @@ class Laws:
 
 
 def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarray) -> np.ndarray:
-    """Sensors (B, steps, sensors) of a model with laws, from states (B, size) under controls."""
+    """Run a model with laws.
+
+    Args:
+        model, data: MuJoCo's.
+        laws: What acts.
+        first: Full states (B, size) to run from.
+        control: Controls (B, steps, actuators).
+
+    Returns:
+        Sensors (B, steps, sensors), as of `mujoco.rollout`.
+    """
     out = np.empty((*control.shape[:2], model.nsensordata))
     plain, nu, step = np.array(model.dof_frictionloss), model.nu, mujoco.mj_step
     # Plain numbers and views of memory, several times as fast as elements and rows of arrays.

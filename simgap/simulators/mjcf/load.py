@@ -61,8 +61,19 @@ class Loaded:
 
 
 def load_mjcf(xml: Path, map_file: Path, candidates: Sequence[str] = ()) -> Loaded:
-    """Read and check a model and its map, with names of further settings to offer as causes; InputError if
-    MuJoCo does not read it, or a name is not in the model."""
+    """Read and check a model and its map.
+
+    Args:
+        xml: The MJCF or URDF file.
+        map_file: Its map (TOML).
+        candidates: Names of further settings to offer as causes.
+
+    Returns:
+        The simulator, and how logs are read for it.
+
+    Raises:
+        InputError: MuJoCo does not read the model, or the map or a candidate names what the model lacks.
+    """
     if not xml.is_file():
         raise InputError(f"--mjcf {xml}", "no such file", "an MJCF or URDF file")
     if xml.suffix.lower() == ".mjb":

@@ -310,8 +310,12 @@ def _carried(model: Any, data: Any, rates: np.ndarray) -> np.ndarray:
 
 
 def ties(model: Any, seen: Sequence[int]) -> list[tuple[int, int, Polynomial]]:
-    """Joints that no column shows but an equality has follow another, in the end one `seen`: the joint, the
-    other, and the polynomial from how far the other is from its reference to how far the joint is."""
+    """Joints that no column shows but an equality has follow another, directly or not, that is `seen`.
+
+    Returns:
+        The joint, the other, and the polynomial of how far the other is from its reference that gives how far
+            the joint is from its own.
+    """
     out, known = list[tuple[int, int, Polynomial]](), {*seen}
     pairs = [
         (int(model.eq_obj1id[k]), int(model.eq_obj2id[k]), Polynomial(model.eq_data[k, :5]))

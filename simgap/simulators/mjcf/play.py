@@ -81,8 +81,19 @@ def played(
     spec: Any, name: str, actuator: str, make: Callable[[Any], Runs], wanted: Sequence[str],
     logs: Mapping[str, Recording], seen: Mapping[str, int],
 ) -> Played | None:  # fmt: skip
-    """Build, by changing `spec`, the model with play in the joint `name` that `actuator` moves; None where it
-    has no rotor that could move alone, or MuJoCo refuses it."""
+    """Build the model with play in a joint.
+
+    Args:
+        spec: The MjSpec, which is changed.
+        name, actuator: The joint, and the actuator that moves it.
+        make: Makes the runs of a model.
+        wanted: Settings that the model is to have.
+        logs: By name.
+        seen: Joint by position column.
+
+    Returns:
+        The model; None where the joint has no rotor that could move alone, or MuJoCo refuses it.
+    """
     joint, body = spec.joint(name), spec.joint(name).parent
     if not joint.armature > 0:
         return None

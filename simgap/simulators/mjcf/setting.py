@@ -305,8 +305,18 @@ KINDS: dict[str, tuple[Callable[[Any, str, str], Setting | None], tuple[str, ...
 
 
 def setting_of(model: Any, name: str) -> Setting:
-    """The setting `KIND:NAME.ATTRIBUTE`, or of the whole model `option.ATTRIBUTE` or `drive.ATTRIBUTE`, with
-    the model's value as its nominal one; InputError names the nearest known."""
+    """The setting of a model by its name.
+
+    Args:
+        model: A compiled MuJoCo model.
+        name: `KIND:NAME.ATTRIBUTE`; `option.ATTRIBUTE` and `drive.ATTRIBUTE` of the whole model.
+
+    Returns:
+        The setting, whose nominal value is the model's.
+
+    Raises:
+        InputError: The name is unknown; the nearest known one is named.
+    """
     where = f"--candidate {name}"
     head, dot, attribute = name.rpartition(".")
     kind, colon, thing = head.partition(":")
