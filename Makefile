@@ -34,7 +34,7 @@ lint: $(INSTALLED)  ## style and format
 	$(BIN)/ruff format --check .
 
 typecheck: $(INSTALLED)  ## static types
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/mypy
 
 tests: $(INSTALLED)  ## tests alone, without those marked slow
 	$(BIN)/pytest -n auto --dist loadfile tests

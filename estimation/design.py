@@ -136,6 +136,9 @@ MOST_BENT = 0.5
 UNLIKE = 0.3  # prior: difference between both pads, as a share of their common deviation: foams of one make
 
 
+Read = Callable[[Trial, Rig, float], Signals]  # signals of a trial by a hand that deviates by a size
+
+
 @dataclass(frozen=True)
 class Nuisance:
     """One deviation of the hand."""
@@ -143,10 +146,10 @@ class Nuisance:
     name: str
     sd: float  # prior
     step: float  # a small deviation for finite differences
-    read: Callable[[Trial, Rig, float], Signals]  # signals of a trial by a hand that deviates by a size
+    read: Read
 
 
-def _with_channel(name: str, change: Callable[[np.ndarray, float], np.ndarray]):
+def _with_channel(name: str, change: Callable[[np.ndarray, float], np.ndarray]) -> Read:
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
         channels = trial.channels | {name: change(trial.channels[name], size)}
         return task_space(replace(trial, channels=channels), rig)
@@ -154,7 +157,7 @@ def _with_channel(name: str, change: Callable[[np.ndarray, float], np.ndarray]):
     return read
 
 
-def _longer_link(finger: int, link: int):
+def _longer_link(finger: int, link: int) -> Read:
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
         fingers, nominal = dict(rig.fingers or {}), rig.finger(finger)
         links = list(nominal.links)
@@ -187,7 +190,7 @@ class PadDoubt:
         return float(np.hypot(SLOPE_SD * (self.give or 1.0), self.apart))
 
 
-def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None):
+def _other_pads(kind: str, fingers: tuple[int, ...], usual: float | None = None) -> Read:
     def read(trial: Trial, rig: Rig, size: float) -> Signals:
         """Pads of 1 + size times the nominal compliance; with `usual`, which give as force^(1 + size)."""
         signals, moved = task_space(trial, rig), {}

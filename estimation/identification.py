@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,11 @@ from hmmseg.jaxconfig import double_precision
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.segmentation.spans import Segmentation
 from hmmseg.tables import Tabled
+
+if TYPE_CHECKING:  # slow to import
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from rich.table import Table
 
 LISTED = 3  # look: most faults listed in a reason
 
@@ -111,17 +116,19 @@ class Identification(Tabled):
             "notes": list(self.notes),
         }  # fmt: skip
 
-    def tables(self):
+    def tables(self) -> "list[Table]":
         """The properties, one a row."""
         return [properties_table(self.to_json())]
 
-    def plot_estimates(self, actual: Actual | None = None, path: str | Path | None = None):
+    def plot_estimates(self, actual: Actual | None = None, path: str | Path | None = None) -> "Axes":
         """Plot every property with its 68 and 95 % interval, against `actual` values if given; the axes."""
         from estimation.plots import draw_estimates
 
         return draw_estimates(self.to_json()["properties"], actual, None if path is None else Path(path))
 
-    def plot_posterior(self, actual: Actual | str | Path | None = None, path: str | Path | None = None):
+    def plot_posterior(
+        self, actual: Actual | str | Path | None = None, path: str | Path | None = None
+    ) -> np.ndarray:
         """Corner plot of the joint posterior; returns the axes (num_properties, num_properties).
 
         A path alone may be given first, as to other plots.
@@ -132,19 +139,19 @@ class Identification(Tabled):
 
         return draw_corner(self.draws, self.names, None if path is None else Path(path), actual)
 
-    def plot_check(self, trial: int = 0, path: str | Path | None = None):
+    def plot_check(self, trial: int = 0, path: str | Path | None = None) -> "list[Axes]":
         """Plot one trial's samples with the predictive band of the posterior; returns the axes."""
         from estimation.plots import draw_check
 
         return draw_check(self, trial, None if path is None else Path(path))
 
-    def to_pandas(self):
+    def to_pandas(self) -> "pd.DataFrame":
         """Posterior draws as a DataFrame, one column `block.property` each [N, m]."""
         import pandas as pd
 
         return pd.DataFrame(self.draws, columns=[".".join(name) for name in self.names])
 
-    def to_arviz(self):
+    def to_arviz(self) -> Any:
         """The properties' posterior in ArviZ's format, dimensions (chain, draw)."""
         if self.sampled is None:
             raise ValueError("no property was determined, so there is no posterior")
@@ -237,7 +244,7 @@ def _friction(
 
 def impossible(design: Design, sampled: Draws) -> dict[str, str]:
     """Why computed properties are rejected, by `object.property`: values that no block has."""
-    out = {}
+    out = dict[str, str]()
     for i, u in ((i, design.unknowns[i]) for i in sampled.impossible):
         size = f"{float(sampled.flat[:, i].mean()):.3g} {UNITS[u.prop]}"
         text = f"{'.'.join(u.name)} comes out at {size}, as no block has it: positions or rig.toml are off"
@@ -264,8 +271,8 @@ def _reasons(
             reason = described.properties[obj][prop].reason
             needed = source_subtasks(described, obj, prop)
             out[f"{obj}.{prop}"] = reason or _not_recorded(aligned, obj, needed)
-        if friction[obj].lower_bound is None:
-            out[f"{obj}.friction"] = friction[obj].reason
+        if (reason := friction[obj].reason) is not None and friction[obj].lower_bound is None:
+            out[f"{obj}.friction"] = reason
     return out
 
 

@@ -225,14 +225,15 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
         prepared.append((thinned, readings, best & present[:, None], masks))
     scales = {}
     for key in KEYS:
-        groups = [of[key] for of in members.values()]
-        scales[key] = _scale([(readings[key], best) for _, readings, best, _ in prepared], groups)
+        indices = [of[key] for of in members.values()]
+        scales[key] = _scale([(readings[key], best) for _, readings, best, _ in prepared], indices)
     pooled: Pooled = {key: [] for key in (*KEYS, *FORCE_CHANNELS)}
     landings = [(a, b) for a, b in pairwise(steps) if (a.state, b.state) == (ABOVE_GROUND, ON_GROUND)]
     touched = {b.move: a.index for a, b in landings}
     weighed = []
     for trial, (thinned, readings, best, masks) in zip(aligned.trials, prepared, strict=True):
-        grips, counts, slopes = {}, {}, {}
+        grips, counts = dict[int, dict[str, np.ndarray]](), dict[int, dict[str, np.ndarray]]()
+        slopes = {}
         for move, of in members.items():
             grips[move], counts[move], groups = {}, {}, {}
             for key, indices in of.items():

@@ -114,7 +114,7 @@ def _between(
 ) -> tuple[np.ndarray, float]:
     """Sample weights (num_timesteps,) of the slope between those that noise allows, and its doubt. Ringing
     forces flatten the slope over their give, errors of places steepen it (`hmmseg.errors_in_variables`)."""
-    count = float(trust.sum()) * max(1 - fitted / max(np.count_nonzero(trust), 1), 0.0)
+    count = float(trust.sum()) * max(1 - fitted / max(int(np.count_nonzero(trust)), 1), 0.0)
     both = float(trust @ (give * place))
     square_give, square_place = float(trust @ give**2), float(trust @ place**2)
     middle, apart = slope_between(square_give, both, square_place, count, sds)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -147,8 +148,10 @@ def draw_estimates(
         ax.text(1.02, -0.85, head, transform=ax.get_yaxis_transform(), va="bottom", fontsize=7.5,
                 style="italic")  # fmt: skip
         ax.set_xlabel("Estimate less measured value [%]" if actual else "About the estimate [%]")
-        handles = [Line2D([], [], color=BLUE, lw=3.2, solid_capstyle="butt", label="68 % interval"),
-                   Line2D([], [], color=BLUE, lw=1.0, label="95 % interval")]  # fmt: skip
+        handles: list[Artist] = [
+            Line2D([], [], color=BLUE, lw=3.2, solid_capstyle="butt", label="68 % interval"),
+            Line2D([], [], color=BLUE, lw=1.0, label="95 % interval"),
+        ]
         if actual:
             handles = [Line2D([], [], color=BLUE, marker="o", ls="", ms=3.5, label="estimate"), *handles]
             handles += [Patch(color=GREY, alpha=0.4, lw=0, label="measured, ± 1 sd")]

@@ -230,7 +230,7 @@ def _climb() -> Callable[[np.ndarray, Model], Any]:
     import jax.numpy as jnp
     import optimistix
 
-    solver = optimistix.BFGS(rtol=TOLERANCE, atol=TOLERANCE)
+    solver: optimistix.BFGS[Any, Any, Any] = optimistix.BFGS(rtol=TOLERANCE, atol=TOLERANCE)
 
     def loss(theta: Any, model: Model) -> Any:
         return -log_density(theta[None], model, jnp)[0]

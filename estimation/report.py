@@ -52,7 +52,7 @@ def read_actual(path: str | Path, objects: Iterable[str]) -> Actual:
 
 def parse_actual(table: dict[str, Any], objects: Iterable[str], where: str = "actual") -> Actual:
     """The same from the table of an `actual.toml`."""
-    known, actual = list(objects), {}
+    known, actual = list(objects), dict[str, Any]()
     for name, entries in table.items():
         if name not in known:
             raise InputError(f"{where}: key {name}", "is not an object of the task", nearest(name, known))

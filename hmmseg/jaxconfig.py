@@ -77,10 +77,10 @@ def _keep_programs() -> None:
     try:
         from jax._src import compilation_cache
 
-        compilation_cache.get_file_cache = lambda path: (_Programs(path), path)
+        setattr(compilation_cache, "get_file_cache", lambda path: (_Programs(path), path))  # noqa: B010
     except (ImportError, AttributeError):  # a version of JAX with other internals
         return
-    jax.config.update("jax_compilation_cache_dir", str(folder / "programs"))
+    jax.config.update("jax_compilation_cache_dir", str(folder / "programs"))  # type: ignore[no-untyped-call]
 
 
 def double_precision(function: Callable[P, R]) -> Callable[P, R]:

@@ -159,9 +159,9 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[Executor]:
         settings = {"n_workers": workers or os.cpu_count(), "threads_per_worker": 1, "processes": True,
                     "dashboard_address": None, "silence_logs": logging.ERROR}  # fmt: skip
     try:
-        client = Client(**settings)
+        client = Client(**settings)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {scheduler}", "no scheduler answers there",
                          "an address as tcp://host:8786, or local") from error  # fmt: skip
     with client:
-        yield client.get_executor()
+        yield client.get_executor()  # type: ignore[no-untyped-call]

@@ -105,7 +105,7 @@ class Output:
             else:
                 usual(message, category, *where)
 
-        warnings.showwarning = show
+        warnings.showwarning = show  # type: ignore[assignment]
         if self.json == STANDARD_OUTPUT:  # stray prints must not spoil the document
             self._cleanup.enter_context(contextlib.redirect_stdout(sys.stderr))
         return self
@@ -208,7 +208,7 @@ def distinct_trials(paths: Sequence[Path]) -> list[Path]:
         if not file.is_dir():
             with named(str(file)), file.open("rb") as opened:
                 digest = hashlib.file_digest(opened, "sha256").hexdigest()
-        for name in parts or [None]:
+        for name in parts or (None,):
             path = given if name is None or name == part else given.with_name(f"{given.name}#{name}")
             content = f"{digest}#{name or ''}"
             if content in seen:

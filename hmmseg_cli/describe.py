@@ -121,7 +121,7 @@ def _state(path: Any) -> str:
 
 def _versions() -> dict[str, str | None]:
     """Version of each required or optional package."""
-    names = {}
+    names = dict[str, str | None]()
     for wanted in importlib.metadata.requires("hmmseg") or ():
         name, _, extra = wanted.partition(";")
         name = re.split(r"[^\w.-]", name.strip(), maxsplit=1)[0]

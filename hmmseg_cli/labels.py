@@ -152,7 +152,7 @@ def write_mcap(path: Path, source: str | Path, trial: Trial, spans: Sequence[Spa
             entry = json.dumps({"subtask_index": number} | body | times)
             when = origin + round(span.start * 1e9)
             writer.add_message(channel, when, entry.encode(), when, number)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
 
 
 def _copy(reader: Any, writer: Any) -> None:

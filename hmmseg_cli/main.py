@@ -63,7 +63,7 @@ for _group, _commands in COMMANDS.items():
             short_help=(_command.__doc__ or "").strip().partition("\n\n")[0],  # in full, not cut short
             epilog=_example,
             rich_help_panel=_group,
-        )(_command)
+        )(_command)  # type: ignore[type-var]
 
 
 def _show_version(wanted: bool) -> None:

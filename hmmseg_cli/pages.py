@@ -159,7 +159,7 @@ def _place(key: tuple[str, str], cells: Sequence[Mapping[str, Any]]) -> tuple[st
 
 def _parameters(effect: Mapping[str, Any], causes: Sequence[str], setting: Setting) -> list[tuple[str, ...]]:
     """Rows of the parameter, the model's value if known, the estimate and its interval."""
-    rows = []
+    rows = list[tuple[str, ...]]()
     for name, p in effect["parameters"].items():
         cause = next((c for c in causes if name.startswith(f"{c}.")), causes[0])
         last = name.rpartition(".")[2]
@@ -215,7 +215,7 @@ def _numerics(body: Body) -> str:
 def _suspects(body: Body, setting: Setting) -> list[tuple[str, ...]]:
     """Rows of all candidates: probability, share of the gap, and where the effect would show."""
     attribution = body.get("attribution") or {}
-    rows = []
+    rows = list[tuple[str, ...]]()
     for name, chance in sorted(finding.chances(body).items(), key=lambda row: -row[1])[:MOST]:
         own, share = attribution.get(name), ""
         idle = own and own.get("share") is not None and own["share"] < NOTHING

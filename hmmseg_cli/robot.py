@@ -188,7 +188,8 @@ def _calibration_tables(document: dict[str, Any]) -> list[Table]:
         shown, value = shown_as(p["unit"]), ("undetermined", "")
         nominal = "" if "nominal" not in p else f"{shown[0] * p['nominal']:.4g} {shown[1]}"
         if p["mean"] is not None:
-            value = estimate(p["mean"], p["sd"], shown), interval(*p["interval_90"], shown=shown)
+            low, high = p["interval_90"]
+            value = estimate(p["mean"], p["sd"], shown), interval(low, high, shown)
         rows.append((p["name"], nominal, *value))
     heads = ("parameter", "the model has", "calibrated", "90 % interval")
     after = document["heldout"]["after"]
@@ -336,7 +337,7 @@ def _history(compared: Mapping[str, Any], now: Mapping[str, Any]) -> list[Any]:
 
 def tables(document: Mapping[str, Any], found: RobotDiagnosis) -> list[Table]:
     """What the logs leave open, the tables of every diagnosis, and held-out residuals."""
-    rows, unseen = [], document["identifiability"]["unseen"]
+    rows, unseen = list[tuple[str, ...]](), document["identifiability"]["unseen"]
     for one in document["identifiability"]["alike"][:6]:
         near = f"are alike but for {100 * one['own']:.1f} %"
         how = "the first acts as the others" if one["exact"] else near

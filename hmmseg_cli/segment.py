@@ -42,7 +42,8 @@ def segment(
         if method is Segmenter.HMM and (force_threshold, velocity_threshold) != (0.05, 0.05):
             where = "--force-threshold, --velocity-threshold"
             raise InputError(where, "go only with the paper's thresholds", "--method qualitative")
-        apart, recordings = workers is not None or scheduler is not None, []
+        apart = workers is not None or scheduler is not None
+        recordings: list[Trial] = []
         paths = distinct_trials(recordings_in(trials) if apart else trials)
         check_destination(write, paths)
         task, rig = find_inputs(paths, task, rig)

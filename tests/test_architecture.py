@@ -23,8 +23,8 @@ PRODUCT = tuple(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"
 LOCAL = {*PRODUCT, "experiments", "paper_figs", "tests"}
 # Import names that differ from the name that is installed.
 DISTRIBUTIONS = {"PIL": "pillow", "mcap_ros2": "mcap-ros2-support", "sklearn": "scikit-learn"}
-TOOLS = {"ipykernel", "build", "furo", "myst-parser", "pre-commit", "pyright", "pytest-xdist", "ruff",
-         "sphinx"}  # fmt: skip
+TOOLS = {"ipykernel", "build", "furo", "myst-parser", "mypy", "pandas-stubs", "pre-commit",
+         "pytest-xdist", "ruff", "scipy-stubs", "sphinx"}  # fmt: skip
 
 
 def tree_of(path: Path) -> ast.Module:

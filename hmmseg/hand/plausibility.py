@@ -301,7 +301,8 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
     there = np.isfinite([s.fx1 - s.fx2, s.distance, s.y, s.fy]).all(axis=0)
     if there.sum() < 4 * BRIEF:
         return []
-    s = replace(s, **{name: v[there] for name, v in vars(s).items() if isinstance(v, np.ndarray)})
+    some: dict[str, Any] = {name: v[there] for name, v in vars(s).items() if isinstance(v, np.ndarray)}
+    s = replace(s, **some)
     squeeze, load = (s.fx1 - s.fx2) / 2, s.fy
     same = _pushing_alike((s.fx1 + s.fx2) / 2, squeeze, load)
     if same is not None:

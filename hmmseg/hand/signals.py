@@ -18,6 +18,7 @@ read: differences between the fingers are rotated back; their mean position and 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -169,7 +170,7 @@ def task_space(trial: Trial, rig: Rig) -> Signals:
                 variances[f"v{axis}"] += variance / 2
     sds = {f"sd_{name}": np.sqrt(variance) for name, variance in variances.items()}
     force = np.nan if noise.force is None else noise.force
-    return Signals(t=trial.t, **out, **sds, sd_force=force, derived=derived,  # type: ignore[arg-type]
+    return Signals(t=trial.t, **out, **sds, sd_force=force, derived=derived,
                    touches=trial.touches, timing=trial.timing, free=trial.free)  # fmt: skip
 
 
@@ -210,7 +211,7 @@ def come_late(trial: Trial) -> bool:
 
 def differenced(signals: Signals) -> Signals:
     """The signals with central differences of positions as velocities."""
-    made = {}
+    made = dict[str, Any]()
     for axis in "xy":
         for i in (1, 2):
             made[f"v{axis}{i}"], window = central_differences(signals.t, getattr(signals, f"{axis}{i}"))

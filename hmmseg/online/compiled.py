@@ -24,7 +24,7 @@ from hmmseg.contact import equations
 try:
     from numba.core.caching import IndexDataCacheFile
 except ImportError:  # untested versions of numba manage their files themselves
-    IndexDataCacheFile: Any = object
+    IndexDataCacheFile = object  # type: ignore[assignment, misc]
 
 HOME, SHARED = cache_folder(), (densities, levels, equations)
 if HOME is not None and not numba.config.CACHE_DIR:  # type: ignore[attr-defined]
@@ -48,16 +48,16 @@ class _Kept(IndexDataCacheFile):
         return programs if of == (self._version, self._source_stamp) else {}
 
     def _save_index(self, overloads: dict[Any, str]) -> None:
-        keep(Path(self._index_path), self._dump(((self._version, self._source_stamp), overloads)))
+        keep(Path(self._index_path), self._dump(((self._version, self._source_stamp), overloads)))  # type: ignore[no-untyped-call]
 
     def _load_data(self, name: str) -> Any:
-        content = kept(Path(self._data_path(name)))
+        content = kept(Path(self._data_path(name)))  # type: ignore[no-untyped-call]
         if content is None:
             raise OSError(name)  # tells numba to compile
         return pickle.loads(content)
 
     def _save_data(self, name: str, data: Any) -> None:
-        keep(Path(self._data_path(name)), self._dump(data))
+        keep(Path(self._data_path(name)), self._dump(data))  # type: ignore[no-untyped-call]
 
 
 def compiled(function: Callable[..., Any]) -> Any:

@@ -134,10 +134,14 @@ class Filter:
         )
         self._x = np.full(1, np.nan).astype(READING)
         self._x["sd_fx"], self._x["sd_fy"], self._x["gripped"] = 0.0, 0.0, 1.0
-        self.now, self.smoothed = np.zeros((2, self.num_steps + 1))  # as `summarise` fills them
+        # As `summarise` fills them.
+        self.now: np.ndarray = np.zeros(self.num_steps + 1)
+        self.smoothed: np.ndarray = np.zeros(self.num_steps + 1)
         self.means = np.zeros((2 * len(task.objects) + len(task.moves), 3))
         # The heaviest hypotheses: round of the one on the task; missed subtask, time [s] and state off it.
-        self._least, self.round, self.departure = np.array(LEAST_SPANS), 0, (0, 0.0, 0)
+        self._least = np.array(LEAST_SPANS)
+        self.round: int = 0
+        self.departure: tuple[int, float, int] = 0, 0.0, 0
         self._state = _State(
             *self._table, 0, np.full(ROWS, np.nan).astype(ROW), np.array([[np.inf, -np.inf]] * 4),
             np.array([(*LEAST_SPANS, 1.0, 1.0)], RANGES), np.zeros(12),

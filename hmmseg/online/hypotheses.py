@@ -28,7 +28,8 @@ from hmmseg.online.hypothesis import (
     log_sum,
     supported,
 )
-from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, RINGING, STAGES
+from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, STAGES
+from hmmseg.segmentation.free_contacts import RINGING
 
 LOG_DEPARTURE = math.log(DEPARTURE)
 PACE = 1.0  # prior: s, mean time in a state; a pace ten times as fast costs 2.3 nats at a boundary

@@ -55,7 +55,8 @@ class Watcher:
             raise InputError("lag", f"found {lag}", "0 s or more")
         self.lag, self.filter = float(lag), Filter(description, hand, float(lag))
         self._wrist = None if hand.gripper is None else Wrist(hand)
-        self.channels, self.optional = self.filter.channels, self.filter.optional
+        self.channels: tuple[str, ...] = self.filter.channels
+        self.optional: tuple[str, ...] = self.filter.optional
         if not hand.jointed and self._wrist is None:
             self.channels, self.optional = (*self.channels, ROLL), (*self.optional, ROLL)
         if self._wrist is not None:

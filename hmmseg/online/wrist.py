@@ -242,7 +242,7 @@ class Opening(Closings):
         self.refused: Held | None = None
         self._way: deque[tuple[float, float, float]] = deque()  # samples since it was widest
         self._low, self._high = math.inf, -math.inf
-        self._noise, self._recent = 0.0, []
+        self._noise, self._recent = 0.0, list[float]()
         self._fastest, self._wide = 0.0, math.nan
 
     @property

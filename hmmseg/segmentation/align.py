@@ -147,7 +147,7 @@ class Rounds:
         boundaries = [b for piece in pieces[:number] for b in piece.boundaries]
         boundaries += [point_mass(last)] * (len(steps) - 1 - len(boundaries))
         present = np.zeros(len(steps), bool)
-        failures, spans = [], []
+        failures, spans = [], list[Span]()
 
         def fail(step: Subtask, reason: str, repetition: int) -> None:
             failures.append(Failure(step.index, step.name, step.object, reason, repetition))

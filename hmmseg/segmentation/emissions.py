@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -300,7 +301,7 @@ def thin(
     if group <= 1:
         return signals
     width = int(np.clip(min(window, 1.0) * rate, 1, group))
-    thinned = {}
+    thinned = dict[str, Any]()
     for name, values in vars(signals).items():
         if isinstance(values, np.ndarray):
             mean, count = grouped(values, group, width)
@@ -349,5 +350,7 @@ def without(f: Features, spans: Sequence[tuple[float, float]]) -> Features:
         blanked |= (f.t >= start) & (f.t <= end)
     if not blanked.any():
         return f
-    channels = {name: np.where(blanked, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")}
+    channels: dict[str, Any] = {
+        name: np.where(blanked, np.nan, getattr(f, name)) for name in ("vx", "vy", "ay", "y", "d")
+    }
     return replace(f, force=np.where(blanked[:, None], np.nan, f.force), **channels)

@@ -167,8 +167,10 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
     return width, _scale(residual, weight, max(old.scale["width"], least), least)
 
 
-def _rest(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Parameters,
-          bias: np.ndarray, gammas: Sequence[np.ndarray]):  # fmt: skip
+def _rest(
+    features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Parameters, bias: np.ndarray,
+    gammas: Sequence[np.ndarray],
+) -> tuple[float, float, tuple[dict[int, float], ...]]:  # fmt: skip
     """Velocity scale, level scale and resting levels of the holds on the ground."""
     velocity, level, weights, levels = [], [], [], []
     columns = [s.index for s in subtasks if s.state in (ON_GROUND, SLIDING)]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,8 @@ class OnDisk:
             for start in range(0, self.t.size, size)
         ]
         arrays = [name for name, value in vars(pieces[0]).items() if isinstance(value, np.ndarray)]
-        return replace(pieces[0], **{n: np.concatenate([getattr(p, n) for p in pieces]) for n in arrays})
+        joined: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in pieces]) for n in arrays}
+        return replace(pieces[0], **joined)
 
 
 Recorded = Signals | OnDisk
@@ -138,7 +140,7 @@ def part(recorded: Recorded, samples: slice) -> Signals:
     """A stretch of a recording."""
     if isinstance(recorded, OnDisk):
         return recorded.read(samples.start, samples.stop)
-    sliced = {k: v[samples] for k, v in vars(recorded).items() if isinstance(v, np.ndarray)}
+    sliced: dict[str, Any] = {k: v[samples] for k, v in vars(recorded).items() if isinstance(v, np.ndarray)}
     return replace(recorded, **sliced)
 
 

@@ -161,7 +161,7 @@ def stretches(
     noise = np.sqrt(2.0) * sd_force
     resting = fy < min(SUPPORTED * weight, weight - 3 * noise)
     pressing = inside & (fx1 > SURE * sd_force) & (-fx2 > SURE * sd_force)
-    out = []
+    out = list[Stretch | None]()
     for load, value, stated, within in (
         (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True),
         (-fy / 2, s.y, s.sd_y / np.sqrt(2), resting),

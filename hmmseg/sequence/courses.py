@@ -126,12 +126,12 @@ def _learn_course(
     aligned = learner.align(initial, learner.law(start))
     emissions, probability = learner.run([a.smoothed for a in aligned], temper, FLOORS[2:], steps=3)
     ends = np.array([p[:, : number - 1].sum(0).cumsum() / len(p) for p in probability])
-    paths = [p.argmax(1) for p in probability]
-    one_hot, stacked = np.eye(number)[np.concatenate(paths)], np.vstack([fill_gaps(v) for v in values])
+    likeliest = [p.argmax(1) for p in probability]
+    one_hot, stacked = np.eye(number)[np.concatenate(likeliest)], np.vstack([fill_gaps(v) for v in values])
     x = np.arcsinh(stacked)
     cost = pooled_costs(one_hot.sum(0), one_hot.T @ x, one_hot.T @ x**2, MERGE_FLOOR) / features
     share = learner.tempered(emissions, probability).temper * features
-    return Course(probability, ends, cost, share, seen(values, paths, number, share))
+    return Course(probability, ends, cost, share, seen(values, likeliest, number, share))
 
 
 def seen(values: Sequence[np.ndarray], paths: Sequence[np.ndarray], number: int, share: float) -> np.ndarray:

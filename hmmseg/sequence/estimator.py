@@ -16,7 +16,7 @@ from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.segment import segment_sequence
 
 
-class OrderedSegmenter(ClusterMixin, BaseEstimator):
+class OrderedSegmenter(ClusterMixin, BaseEstimator):  # type: ignore[misc]  # untyped
     """Segments sequences whose states follow one another in a known order, with or without labels.
 
     X is one sequence (num_timesteps, num_channels) or a list of several.

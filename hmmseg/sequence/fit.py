@@ -146,7 +146,7 @@ def label_files(where: Path, trials: Sequence[Trial]) -> dict[str, Any]:
     if not where.is_file() or where.suffix.lower() not in (".csv", ".tsv"):
         problem = f"ends in {where.suffix!r}" if where.is_file() else "no such file or folder"
         raise InputError(f"labels {where}", problem, "a folder or a .csv file")
-    found = {}
+    found = dict[str, dict[str, float]]()
     for given, starts in _table(where).items():
         names = [trial.name for trial in trials if _is_named(given, trial)]
         if not names:

@@ -308,7 +308,7 @@ def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarra
     gap is as large as the noise, in mean square over its samples.
     """
     key, energy, count = tallied(rows, band, left, noise)
-    chance = chi2.sf(energy, count)
+    chance = np.asarray(chi2.sf(energy, count))
     shown = false_discovery_control(np.clip(chance, 0, 1), method="bh") < RATE
     excess = np.where(shown, energy - count, 0.0)
     _, cell = np.unique(key // len(rows.bands), return_inverse=True)
@@ -322,7 +322,7 @@ def significant(rows: Rows, band: np.ndarray, left: np.ndarray, noise: np.ndarra
         cell, part = divmod(cell, len(rows.parts))
         trial, channel = divmod(cell, len(rows.channels))
         # beyond the smallest representable probability
-        z = float(norm.isf(chance[at])) if chance[at] > 1e-300 else float(np.sqrt(2 * excess[at] / 2 + 37**2))
+        z = float(norm.isf(chance[at]) if chance[at] > 1e-300 else np.sqrt(2 * excess[at] / 2 + 37**2))
         out.append(Cell(rows.trials[trial], rows.channels[channel], rows.parts[part],
                         (edges[b], edges[b + 1]), float(excess[at]) / total, z))  # fmt: skip
     return tuple(sorted(out, key=lambda c: -c.share))

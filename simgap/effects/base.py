@@ -248,7 +248,7 @@ def table(document: tomlkit.TOMLDocument, name: str) -> Table:
     if name not in document:
         document.add(tomlkit.nl())
         document.add(name, tomlkit.table(name == "effects"))
-    return document[name]  # type: ignore[return-value]
+    return document[name]
 
 
 def number(value: float) -> float:

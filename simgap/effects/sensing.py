@@ -130,7 +130,7 @@ def _crosstalk(values: Values) -> np.ndarray:
 
 def _turned(values: Values) -> np.ndarray:
     c, s = ([f(values[n]) for n in ("angle1", "angle2")] for f in (np.cos, np.sin))
-    return np.asarray(block_diag(*([[c[k], -s[k]], [s[k], c[k]]] for k in (0, 1))))
+    return np.asarray(block_diag(*(np.array([[c[k], -s[k]], [s[k], c[k]]]) for k in (0, 1))))
 
 
 FORCE_CROSSTALK = mixing(

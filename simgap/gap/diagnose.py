@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,6 +40,10 @@ from simgap.gap.residuals import net_forces
 from simgap.gap.search import Identified, Search, search
 from simgap.progress import Progress, silent
 from simgap.report.finding import sentence, tables
+
+if TYPE_CHECKING:  # slow to import
+    from matplotlib.axes import Axes
+    from rich.table import Table
 
 # Where a gap lies: cells whose residuals show it, and those whose signals the named causes shift.
 
@@ -264,11 +268,11 @@ class Diagnosis(Tabled):
         """The verdict in a sentence."""
         return sentence(self.body)
 
-    def tables(self):
+    def tables(self) -> list[Table]:
         """Tables of the probabilities, the causes' parameters, and the largest cells."""
         return tables(self.body)
 
-    def to_arviz(self):
+    def to_arviz(self) -> Any:
         """ArviZ InferenceData: draws `effect.parameter` of each described effect, given that it acts.
 
         Each effect is drawn separately.
@@ -285,7 +289,7 @@ class Diagnosis(Tabled):
         }
         return inference_data(every)
 
-    def plot_where(self, path: str | Path | None = None):
+    def plot_where(self, path: str | Path | None = None) -> Axes:
         """Plot the share of the gap by channel and subtask; returns the axes and saves them if a path is
         given.
         """
@@ -294,7 +298,7 @@ class Diagnosis(Tabled):
         names = dict.fromkeys(step.label for step in subtasks(self.problem.frame.task))
         return draw_heat_map(self.body, list(names), None if path is None else Path(path))
 
-    def plot_causes(self, path: str | Path | None = None):
+    def plot_causes(self, path: str | Path | None = None) -> Axes:
         """Plot the probability of each effect and the share of the gap it explains; returns the axes."""
         from simgap.report.figures import draw_suspects
 

@@ -304,7 +304,7 @@ def _moves(
 ) -> np.ndarray:
     """Move of each sample; free motion belongs to the nearer grip."""
     own = [-1 if s.state == FREE or s.move is None else s.move for s in steps]
-    starts, ends = {}, {}
+    starts, ends = dict[int, int](), dict[int, int]()
     for k, move in enumerate(own):
         if move >= 0:
             starts.setdefault(move, boundaries[k - 1])

@@ -48,7 +48,7 @@ def scene_of(rig: Rig, blocks: Blocks, effects: Values) -> tuple[Rig, Surroundin
     for name, values in effects.items():
         change = effect_named(name).scene
         scene |= change(dict(values)) if change else {}
-    pads = {k: scene[k] for k in ("normal_stiffness", "shear_stiffness") if k in scene}
+    pads: dict[str, float] = {k: scene[k] for k in ("normal_stiffness", "shear_stiffness") if k in scene}
     hand = rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
     around = Surroundings(**{k: scene[k] for k in ("tilt", "support_stiffness") if k in scene})
     if "friction" in scene:

@@ -409,7 +409,7 @@ def _parameters(given: Scene, name: str, found: Mapping[str, ParameterPosterior]
             out[key] = _entry(mean, sd, ends, p.unit)
     if rung and (ring := given.ring) is not None:
         size, sd, c = max((*map(float, np.hypot(*np.reshape(v, (-1, 2)))), c) for (c, _), v in rung.items())
-        ends, unit = (max(size - 1.645 * sd, 0.0), size + 1.645 * sd), lay.ensembles.channels[c]
+        ends, unit = (max(size - 1.645 * sd, 0.0), size + 1.645 * sd), lay.ensembles.channels[int(c)]
         out |= {"frequency": _entry(ring.frequency, ring.frequency_sd, ring.frequency_90, "Hz"),
                 "damping": _entry(ring.damping, ring.damping_sd, ring.damping_90, "1"),
                 "gain": _entry(size, sd, ends, f"unit of {unit}")}  # fmt: skip

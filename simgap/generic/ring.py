@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -25,6 +26,9 @@ SWING = 1 / 3  # chosen: first share of a window, searched for the largest swing
 SHORTEST = 12  # numerics: samples; an oscillation is searched for in no shorter window
 PERIODS = 1.5  # chosen: periods of the slowest oscillation that a window must hold
 HIGHEST = 0.4  # chosen: highest frequency searched, over the sampling rate
+SIMPLEX: dict[str, Any] = {  # numerics: of the search
+    "method": "Nelder-Mead", "options": {"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},
+}  # fmt: skip
 RINGS = 0.2  # chosen: share of the variance after an event that an oscillation must explain
 
 
@@ -102,10 +106,10 @@ def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
     ends = np.log([_range(windows, rate), (LIGHTEST, HEAVIEST)])
 
     def refined(windows: np.ndarray, start: np.ndarray) -> np.ndarray:
-        return minimize(
-            lambda u: np.log(_left(windows, rate, *np.exp(u))), start, method="Nelder-Mead",
-            bounds=[*map(tuple, ends)], options={"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},
-        ).x  # fmt: skip
+        def cost(u: np.ndarray) -> float:
+            return float(np.log(_left(windows, rate, *np.exp(u))))
+
+        return minimize(cost, start, **{**SIMPLEX, "bounds": ends}).x
 
     *start, left = _screened(windows, rate)
     if left == 1.0:

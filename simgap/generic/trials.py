@@ -282,7 +282,7 @@ def resampled(t: np.ndarray, values: np.ndarray, times: np.ndarray, rate: float)
 
 def means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Means of a linearly interpolated signal between neighbouring edges [s] (along the last axis)."""
-    total = cumulative_trapezoid(values, t, initial=0.0)
+    total = cumulative_trapezoid(values, t, initial=0)
     # Between samples the integral of a straight line is a parabola.
     k = np.clip(np.searchsorted(t, edges, side="right") - 1, 0, t.size - 2)
     w = edges - t[k]

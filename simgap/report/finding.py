@@ -371,8 +371,8 @@ def share_of(cells: Sequence[Mapping[str, Any]]) -> float:
 def tables(body: Body) -> list[Table]:
     """Tables of probabilities, the cause's parameters, the next experiment and the largest cells."""
     likely = sorted(body["probabilities"].items(), key=lambda item: -item[1])[:6]
-    rows = [(name, f"{value:.3f}") for name, value in likely]
-    out = [listed("probabilities", ("candidate", "probability"), rows, right=["probability"])]
+    chances = [(name, f"{value:.3f}") for name, value in likely]
+    out = [listed("probabilities", ("candidate", "probability"), chances, right=["probability"])]
     if body["causes"]:
         rows = []
         for name, p in body["effects"]["+".join(body["causes"])]["parameters"].items():

@@ -8,9 +8,10 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 
 from hmmseg.errors import InputError, nearest
+from simgap.effect import Parameter
 from simgap.robot_effects import commands, readouts
 from simgap.robot_effects.base import RobotEffect, Setting
-from simgap.simulators.protocol import Parameter, Simulator
+from simgap.simulators.protocol import Simulator
 from simgap.simulators.recording import Recording
 
 FAMILIES = (commands, readouts)

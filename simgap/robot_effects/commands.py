@@ -12,7 +12,7 @@ import numpy as np
 from simgap.channels import ChannelEffect, Theta, channel_effects
 from simgap.channels.drives import LARGEST
 from simgap.effect import Parameter
-from simgap.robot_effects.base import RobotEffect, Setting
+from simgap.robot_effects.base import Command, RobotEffect, Setting
 from simgap.simulators.recording import Recording
 
 TICK = 1e-9  # numerics: s: rounding of equal times
@@ -57,7 +57,7 @@ def _of(setting: Setting, name: str, effect: ChannelEffect) -> RobotEffect:
     )
 
 
-def _late(names: list[str]):
+def _late(names: list[str]) -> Command:
     def late(recording: Recording, theta: Theta) -> Recording:
         at = recording.t - theta["delay"]
         return recording.with_columns({n: np.interp(at, recording.t, recording[n]) for n in names})
@@ -65,7 +65,7 @@ def _late(names: list[str]):
     return late
 
 
-def _late_by_time(names: list[str], acts: str):
+def _late_by_time(names: list[str], acts: str) -> Command:
     """For a simulator that takes the times at which each row's commands are carried out: the same commands,
     later, and with each row those that follow."""
 
@@ -82,7 +82,7 @@ def _late_by_time(names: list[str], acts: str):
     return late
 
 
-def _sagging(names: list[str], supply: str, usual: float):
+def _sagging(names: list[str], supply: str, usual: float) -> Command:
     def act(recording: Recording, theta: Theta) -> Recording:
         scale = 1 + theta["share"] * (recording[supply] / usual - 1)
         return recording.with_columns({n: scale * recording[n] for n in names})

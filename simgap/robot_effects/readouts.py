@@ -113,7 +113,7 @@ def of_pose(body: str, columns: Mapping[str, str]) -> Iterator[RobotEffect]:
 
     def turned(t: np.ndarray, known: Channels, theta: Theta, way: float) -> Channels:
         half = 0.5 * way * np.array([theta[f"about_{a}"] for a in PLACE])
-        small = np.array([np.sqrt(max(1.0 - half @ half, 0.0)), *half])
+        small = np.array([np.sqrt(max(1.0 - float(half @ half), 0.0)), *half])
         found = product(np.array([known[n] for n in turn]), small[:, None])
         return dict(zip(turn, found, strict=True))
 

@@ -150,7 +150,7 @@ def _echelon(rows: np.ndarray, size: np.ndarray) -> list[np.ndarray]:
     """
     out, free = rows.copy(), list(range(rows.shape[1]))
     for k in range(len(out)):
-        pivot = max(free, key=lambda j, k=k: abs(out[k, j]) * size[j])
+        pivot = free[int(np.argmax(np.abs(out[k, free]) * size[free]))]
         free.remove(pivot)
         out[k] /= out[k, pivot]
         for i in range(len(out)):

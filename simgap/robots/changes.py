@@ -33,8 +33,10 @@ A change of a positive quantity is one of its logarithm (a gain doubled: log 2),
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -100,7 +102,7 @@ class Change:
     def by_chance(self) -> float:
         """The p-value of its surest coordinate, were nothing changed."""
         each = 2 * student.sf(np.abs(self.x) / np.maximum(self.sd, 1e-12), self.freedom)
-        return min(1.0, self.x.size * float(each.min()))
+        return min(1.0, self.x.size * float(np.min(each)))
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,7 @@ class Comparison:
         moved = [np.zeros((n, k)) for n in map(len, (runs.units, old.units))]
         for u in range(left.size):
             step = np.linalg.lstsq(total - information[u], rest - pull[u], rcond=None)[0]
-            there = best_of_halves(lambda z, u=u: of.cost(z, u), z, step)
+            there = best_of_halves(partial(of.cost, without=u), z, step)
             left[u], moved[0][u] = runs.losses(of.point(there), u)[1], (there - z)[p:]
         for u in range(len(old.units)):
             less, push = total.copy(), rest.copy()
@@ -569,7 +571,7 @@ def _chances(best: Change, weight: Mapping[str, float], p_value: float, worse: f
 
     def odds(p: float) -> float:
         p = max(p, 1e-12)
-        return 1.0 if p >= np.exp(-1) else float(-np.e * p * np.log(p))
+        return 1.0 if p >= math.exp(-1) else -math.e * p * math.log(p)
 
     none, unknown = odds(p_value) if best.effects else 1.0, odds(UNKNOWN) / (odds(UNKNOWN) + odds(worse))
     every = {**weight, **({"+".join(sorted(best.effects)): 1.0} if best.effects else {})}

@@ -356,7 +356,7 @@ class Search:
         small change. They stay as they were where the search began; the leading ones are rolled out anew.
         """
         composed, held = at.composed, at.names
-        base, more = base_at(composed, at.point), {}
+        base, more = base_at(composed, at.point), dict[str, Moved]()
         for name in names:
             if name not in held:
                 if name not in self.columns:

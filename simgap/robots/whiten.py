@@ -37,10 +37,10 @@ from simgap.robots.model import Composed
 from simgap.robots.windows import DOUBT, FLIES, REGIMES, RESTS, STRIKES
 from simgap.simulators.protocol import RATE
 
-dpotrf: Any = lapack.dpotrf  # type: ignore[attr-defined]
-dpotri: Any = lapack.dpotri  # type: ignore[attr-defined]
-dtrtrs: Any = lapack.dtrtrs  # type: ignore[attr-defined]
-dtrtri: Any = lapack.dtrtri  # type: ignore[attr-defined]
+dpotrf: Any = lapack.dpotrf
+dpotri: Any = lapack.dpotri
+dtrtrs: Any = lapack.dtrtrs
+dtrtri: Any = lapack.dtrtri
 
 TAU = 0.1  # prior: s: how long unmodelled torques last
 ENOUGH = 40  # numerics: windows from which discrepancies are learned
@@ -185,7 +185,7 @@ class Covariances:
         plain = smooth.cost(np.full(len(names), -np.inf), left, rest)[0]
         while names:
             bounds = [(v - 20.0, v + 12.0) for v in x]
-            given = {"args": (left, rest), "jac": True, "bounds": bounds, "options": CLOSE}
+            given: dict[str, Any] = {"args": (left, rest), "jac": True, "bounds": bounds, "options": CLOSE}
             begun = [x - below for below in BELOW[: 2 if len(names) == len(self.names) else 1]]
             ended = [minimize(smooth.cost, one, method="L-BFGS-B", **given) for one in begun]
             done = min(ended, key=lambda one: one.fun)

@@ -81,7 +81,7 @@ def require_encoder(suffix: str) -> None:
         raise InputError("--animation mp4", "the program ffmpeg is not installed", "gif, or ffmpeg")
 
 
-def _draw_scene(stage: Axes, scene: Scene):
+def _draw_scene(stage: Axes, scene: Scene) -> tuple[list[Rectangle], list[Rectangle], list[Line2D]]:
     """Draw ground, blocks, pads and links; the artists that move."""
     seen = np.concatenate([scene.motion.position.reshape(-1, 2), scene.motion.blocks.reshape(-1, 2)])
     left, right = scene.motion.position[..., 0].min(), scene.motion.position[..., 0].max()
@@ -90,11 +90,12 @@ def _draw_scene(stage: Axes, scene: Scene):
     stage.set(xlim=(left - 2, right + 2), ylim=(-0.4, top + 2), aspect="equal")
     stage.set(xlabel="x [cm]", ylabel="y [cm]")
     stage.axhline(0.0, color=INK, lw=1.0)
-    bodies = []
+    bodies = list[Rectangle]()
     for k, (name, block) in enumerate(scene.blocks.items()):
         body = Rectangle((0, 0), 100 * block.width, 100 * block.height, facecolor=OTHER_COLOURS[k % 7],
                          edgecolor=INK, lw=0.6, alpha=0.8, label=name)  # fmt: skip
-        bodies.append(stage.add_patch(body))
+        stage.add_patch(body)
+        bodies.append(body)
     pads = [Rectangle((0, 0), 100 * PAD[0], 100 * PAD[1], facecolor=GREY, edgecolor=INK, lw=0.6)
             for _ in range(2)]  # fmt: skip
     for pad in pads:

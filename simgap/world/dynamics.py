@@ -167,7 +167,8 @@ def interact(physics: Physics, state: State, tips: Tips) -> tuple[State, Loads]:
     support: list[Scalar] = [0.0] * n
     tip_x: list[Scalar] = [0.0, 0.0]
     tip_y: list[Scalar] = [0.0, 0.0]
-    pads, normals = ([], []), ([], [])
+    pads: tuple[list[Scalar], list[Scalar]] = ([], [])
+    normals: tuple[list[Scalar], list[Scalar]] = ([], [])
     for finger, sign in ((0, 1.0), (1, -1.0)):
         for i in range(n):
             push, shear, anchor = _pad(physics, state, tips, finger, sign, i)

@@ -13,7 +13,7 @@ import numpy as np
 import tomlkit
 from jax import Array
 
-from hmmseg.contact.decompose import subtasks
+from hmmseg.contact.decompose import UNITS, subtasks
 from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import inverse, joint_velocity, require_reach
 from hmmseg.hand.signals import task_space
@@ -26,7 +26,7 @@ from hmmseg.tables import Tabled
 from simgap.world import dynamics
 from simgap.world.dynamics import CONTROL_PERIOD, Physics, Record, State
 from simgap.world.operator import OperatorSettings, Plan, Window, plan
-from simgap.world.properties import UNITS, Blocks, blocks_table
+from simgap.world.properties import Blocks, blocks_table
 from simgap.world.virtual_model import Surroundings, physics, substeps_for
 
 # What the hand's sensors record of a true motion: samples with the rig's noise.

@@ -144,7 +144,7 @@ class VirtualModel:
     @double_precision
     def prepare(self, dt: float) -> None:
         """Compile the step for a period dt [s] before a loop begins."""
-        jax.block_until_ready(self._advance(np.zeros(8), np.zeros(8), dt))
+        jax.block_until_ready(self._advance(np.zeros(8), np.zeros(8), dt))  # type: ignore[no-untyped-call]
 
     @double_precision
     def step(self, finger_positions: ArrayLike, finger_velocities: ArrayLike, dt: float) -> np.ndarray:

@@ -106,21 +106,20 @@ def with_subtasks(table: pa.Table, subtasks: Mapping[int, Sequence[tuple[float, 
     episodes = table.column(EPISODE).to_numpy()
     by_episode: dict[int, list[dict[str, Any]]] = {}
     for number in np.unique(episodes).tolist():
-        rows = language_rows(table.filter(pa.array(episodes == number)))
-        rows = rows + [
+        by_episode[number] = language_rows(table.filter(pa.array(episodes == number)))
+        by_episode[number] += [
             {"role": "assistant", "content": name, "style": "subtask", "timestamp": start, "camera": None,
              "tool_calls": None}
             for start, name in subtasks.get(number, ())
         ]  # fmt: skip
-        by_episode[number] = rows
-    for name, each, rows in (
+    for name, each, filled in (
         (PERSISTENT, [*fields, ("timestamp", pa.float32(), False), *more], by_episode),
-        (EVENTS, [*fields, *more], {number: [] for number in by_episode}),
+        (EVENTS, [*fields, *more], {key: list[dict[str, Any]]() for key in by_episode}),
     ):
         if name == EVENTS and name in table.column_names:
             continue
         kind = pa.list_(pa.struct([pa.field(key, kind, nullable=empty) for key, kind, empty in each]))
-        values = pa.array([rows[number] for number in episodes.tolist()], type=kind)
+        values = pa.array([filled[number] for number in episodes.tolist()], type=kind)
         if hasattr(pa, "json_"):  # as LeRobot has it, where pyarrow knows it
             at = kind.value_type.get_field_index("tool_calls")
             inner = [kind.value_type.field(i) for i in range(kind.value_type.num_fields)]

@@ -141,15 +141,15 @@ def _messages(path: Path, notes: list[str]) -> Iterator[Message]:
 
 
 def _mcap_messages(file: BufferedReader, path: Path, notes: list[str]) -> Iterator[Message]:
-    from mcap.records import Channel, Footer, Message, Schema
+    from mcap import records
     from mcap.stream_reader import StreamReader
     from mcap_ros2.decoder import DecoderFactory
 
-    schemas: dict[int, Schema] = {}
+    schemas: dict[int, records.Schema] = {}
     channels: dict[int, tuple[str, Callable[[bytes], Any]]] = {}
     factory, finished = DecoderFactory(), False
 
-    def decoder(channel: Channel) -> Callable[[bytes], Any]:
+    def decoder(channel: records.Channel) -> Callable[[bytes], Any]:
         if channel.message_encoding == "json":
             return json.loads
 
@@ -162,14 +162,14 @@ def _mcap_messages(file: BufferedReader, path: Path, notes: list[str]) -> Iterat
         return decode
 
     for record in StreamReader(file, validate_crcs=True).records:
-        if isinstance(record, Schema):
+        if isinstance(record, records.Schema):
             schemas[record.id] = record
-        elif isinstance(record, Channel):
+        elif isinstance(record, records.Channel):
             channels[record.id] = record.topic, decoder(record)
-        elif isinstance(record, Message):
+        elif isinstance(record, records.Message):
             topic, decode = channels[record.channel_id]
             yield topic, record.log_time, partial(decode, record.data)
-        finished = finished or isinstance(record, Footer)
+        finished = finished or isinstance(record, records.Footer)
     if not finished:
         notes.append(f"{path}: has no end: the recording was broken off and is read as far as it goes")
 

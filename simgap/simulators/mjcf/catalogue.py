@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import HINGE, JOINT, SLIDE, mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator, tied
@@ -33,7 +34,6 @@ from simgap.simulators.mjcf.setting import (
     strength_of,
 )
 from simgap.simulators.mjcf.transmission import SHARE, Motion, elasticity, motion_of, periods, sizes_of
-from simgap.simulators.protocol import Parameter
 from simgap.simulators.recording import Recording
 
 GAP = 0.02  # prior: share of a joint's reach: the usual play

@@ -54,7 +54,7 @@ class Laws:
     def of(cls, model: Any, changed: Sequence[tuple[str, float]]) -> Laws:
         """The laws of the changed settings."""
         joints: dict[str, dict[str, float]] = {}
-        fading, uneven = [], []
+        fading, uneven = [], list[tuple[int, int, float, float, float, bool]]()
         for name, value in changed:
             head, _, attribute = name.rpartition(".")
             kind, _, thing = head.partition(":")
@@ -74,9 +74,9 @@ class Laws:
             if share or skew or extra or drag:
                 friction.append(_Friction(dof, share, skew, extra, max(speed, 1e-9), drag))
             for scaled in (False, True):
-                wave = [own.get(n, 0.0) for n in UNEVEN[3 * scaled : 3 + 3 * scaled]]
-                if any(wave[1:]):
-                    uneven.append((place, dof, *wave, scaled))
+                often, even, odd = (own.get(n, 0.0) for n in UNEVEN[3 * scaled : 3 + 3 * scaled])
+                if even or odd:
+                    uneven.append((place, dof, often, even, odd, scaled))
         return cls(tuple(friction), tuple(fading), tuple(uneven))
 
 

@@ -186,7 +186,8 @@ def _simulator(
     model: Any, described: Map, file: str, address: Mapping[str, tuple[str, int]]
 ) -> tuple[MjcfSimulator, list[str]]:
     """The simulator without parameters, and warnings of what its columns leave open."""
-    channels, sensors, joints, driven, poses, warnings = {}, {}, {}, {}, {}, []
+    channels, sensors, joints, driven, warnings = {}, {}, {}, {}, []
+    poses = dict[str, dict[str, str]]()
     for column, m in described.columns.items():
         unit = _unit(model, m)
         _check_unit(f"{file}: columns.{column}.unit", m, unit)

@@ -7,19 +7,21 @@ import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import Polynomial
 
 from hmmseg.robust import bridged
+from simgap.effect import Parameter
 from simgap.latest import latest
 from simgap.simulators.mjcf.engine import FULL, HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map
 from simgap.simulators.mjcf.play import Played
 from simgap.simulators.mjcf.runs import ACTS, Runs, body_rate, free_run
 from simgap.simulators.mjcf.setting import HOLD, LATE, SMOOTH, Setting, changed_model, nothing, object_id
-from simgap.simulators.protocol import RATE, Channel, Channels, Job, Parameter, Values
+from simgap.simulators.protocol import RATE, Channel, Channels, Job, Values
 from simgap.simulators.recording import Recording
 
 CLOSING, CLOSED = 20, 1e-9  # numerics: most steps that close a loop, and the last of them
@@ -113,7 +115,7 @@ class MjcfSimulator:
         bare, ran = None if self._partial else self._reset(), dict[str, np.ndarray]()
         for log in {job.recording.name for job in jobs if job.start is not None} & self._logs.keys():
             key, most = (log, softness), 2 * len(self._logs)  # as the model came, and one other
-            ran[log] = latest(self._ran, key, lambda log=log: self._run(log, softness), most)
+            ran[log] = latest(self._ran, key, partial(self._run, log, softness), most)
         return np.array([self._state(job, bare, ran.get(job.recording.name)) for job in jobs])
 
     def _run(self, log: str, softness: tuple[tuple[str, float], ...]) -> np.ndarray:
@@ -327,7 +329,7 @@ def ties(model: Any, seen: Sequence[int]) -> list[tuple[int, int, Polynomial]]:
             if joint not in known and other in known:
                 out.append((joint, other, by))
             elif other not in known and joint in known and slope and not any(more):
-                out.append((other, joint, Polynomial([-first / slope, 1 / slope])))
+                out.append((other, joint, Polynomial([-float(first) / float(slope), 1 / float(slope)])))
             known |= {one for one, _, _ in out}
     return out
 
@@ -356,7 +358,7 @@ def closed(t: np.ndarray, sets: Sequence[Pairs]) -> list[Pairs]:
 
 def touching_pairs(model: Any, data: Any, poses: np.ndarray, at: Sequence[int]) -> list[Pairs]:
     """Pairs of geoms that touch in each pose (n, k) of the coordinates `at` (k,)."""
-    out, none = [], frozenset()
+    out, none = [], frozenset[tuple[int, int]]()
     for pose in poses:
         data.qpos[at] = pose
         mujoco.mj_kinematics(model, data)

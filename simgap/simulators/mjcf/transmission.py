@@ -10,11 +10,12 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from simgap.attribution.verdict import ALARM
+from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf.engine import mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.setting import name_of, object_id
-from simgap.simulators.protocol import Channels, Parameter
+from simgap.simulators.protocol import Channels
 from simgap.simulators.recording import Recording
 
 LIGHT = 1e-6  # numerics: m N m: a smaller torque times lever counts as none
@@ -175,7 +176,7 @@ def smoothed(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     even = np.interp(grid, t[seen], values[seen])
     width = min(max(7, 2 * round(SPAN / step / 2) + 1), (grid.size - 1) // 2 * 2 + 1)
     order = min(3, width - 1)
-    return tuple(  # type: ignore[return-value]
+    return tuple(
         np.interp(t, grid, np.asarray(savgol_filter(even, width, order, deriv=d, delta=step)))
         for d in range(3)
     )
