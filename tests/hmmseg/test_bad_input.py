@@ -144,8 +144,8 @@ def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
                      "r.html"], ["inspect", "bad.csv", "--write", "bad.toml", "--json", "a.json"],
                     ["simulate", *hand, "--properties", "bad.csv", "--output", "s"]):  # fmt: skip
         assert main(command) == 2
-        lines = capsys.readouterr().err.strip().splitlines()
-        assert len(lines) == 1 and ("half.csv" not in command or "not show the whole task" in lines[0]), lines
+        half, lines = "half.csv" in command, capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 + half and ("not show the whole task" in lines[-1]) == half, lines
         assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -323,7 +323,7 @@ def test_a_damaged_file_is_said_once_and_made_anew(damage, tmp_path):
     assert [w.category for w in said] == ([] if damage == "folder" else [CacheWarning])
     keep(path, b"3")
     assert kept(path) == (None if damage == "folder" else b"3")
-    assert sorted(os.listdir(tmp_path / "new")) == ["one.json", "other.json"]
+    assert {"one.json"} <= {*os.listdir(tmp_path / "new")} <= {"one.json", "other.json"}
 
 
 @pytest.mark.parametrize("where", ["/proc/nowhere", "a file", "relative", ""])

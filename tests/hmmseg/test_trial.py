@@ -466,7 +466,7 @@ def move(**entry):
     (blocks(objects={"a": {"on": "a"}}), "key objects.a.on: objects stand on each other in a circle"),
     (blocks(objects={"a": {"on": "b"}, "b": {"on": "a"}}), "key objects.a.on: .* in a circle"),
     (blocks(objects={"a": {"on": "c"}, "b": {"on": "c"}, "c": {"on": "ground"}}), ".*c' already carries 'a"),
-    (blocks(repeat=0), 'task: key repeat: found 0; expected a whole number from 1 to 1000 or "unknown"'),
+    (blocks(repeat=0), 'key repeat: found 0; expected a whole number from 1 to 1000 or "unknown"'),
     (blocks(repeat=True), "key repeat: found True"),
     (blocks(repeat=10**9), "key repeat: found 1000000000"),
     (blocks(moves=["block1"]), "move 1: found 'block1'; expected a table with object and to"),
