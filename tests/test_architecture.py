@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -65,10 +64,10 @@ def test_no_module_is_longer_than_one_idea_takes(tree):
     assert lines and {str(path): count for path, count in lines.items() if count > 700} == {}
 
 
-def imported_packages(nodes: Iterable[ast.AST]) -> set[str]:
-    """Top packages that some statements of a module import; a relative import is its own package."""
+def imported(path: Path) -> set[str]:
+    """Top packages that a module imports anywhere; a relative import is its own package."""
     found = set()
-    for node in nodes:
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name.split(".")[0] for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -76,15 +75,10 @@ def imported_packages(nodes: Iterable[ast.AST]) -> set[str]:
     return found
 
 
-def upward(package: str, source: str) -> set[str]:
-    """Packages of higher floors that a module of `package` imports."""
-    return imported_packages(ast.walk(ast.parse(source))) & set(FLOORS[: FLOORS.index(package)])
-
-
 @pytest.mark.parametrize("package", FLOORS)
 def test_imports_run_downwards(package):
     for path in sorted((ROOT / package).rglob("*.py")):
-        above = upward(package, path.read_text(encoding="utf-8"))
+        above = imported(path) & set(FLOORS[: FLOORS.index(package)])
         assert not above, f"{path.relative_to(ROOT)} imports {', '.join(sorted(above))} from above"
 
 
@@ -93,7 +87,7 @@ def test_imports_within_hmmseg_run_downwards(room):
     """`Trial.read` alone looks up, to what judges a hand's recording: it is where users look for it."""
     above = {f"hmmseg.{name}" for name in ROOMS[: ROOMS.index(room)]}
     for path in sorted((ROOT / "hmmseg" / room).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.ImportFrom) and node.module:
                 seen = ".".join(node.module.split(".")[:2])
                 allowed = path.name == "trial.py" and node.module == "hmmseg.hand.read"
@@ -119,20 +113,11 @@ def declared(extra: str | None = None) -> set[str]:
     return {requirement(entry) for entry in entries} - {"hmmseg"}
 
 
-def imported(source: str) -> tuple[set[str], set[str]]:
-    """Distributions that a module imports at its top, and those it imports anywhere."""
-    tree = ast.parse(source)
-
-    def names(nodes) -> set[str]:
-        found = imported_packages(nodes)
-        return {DISTRIBUTIONS.get(n, n) for n in found if n not in sys.stdlib_module_names and n not in LOCAL}
-
-    return names(tree.body), names(ast.walk(tree))
-
-
 def everywhere(*packages: str) -> set[str]:
+    """Distributions that the modules of packages import anywhere."""
     paths = [path for package in packages for path in (ROOT / package).rglob("*.py")]
-    return set().union(*(imported(path.read_text(encoding="utf-8"))[1] for path in paths))
+    found = set().union(*(imported(path) for path in paths))
+    return {DISTRIBUTIONS.get(name, name) for name in found - sys.stdlib_module_names - LOCAL}
 
 
 def extras() -> dict[str, set[str]]:
