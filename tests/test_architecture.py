@@ -196,7 +196,7 @@ PUBLIC = {hmmseg: "InputError Rig Segmentation Task Trial Watcher __version__ al
           simgap: "Block Diagnosis SimulatedTrial VirtualModel diagnose effects simulate"}  # fmt: skip
 CELLS = ("import hmmseg\nfolder = hmmseg.example_folder()\n"
          "found = hmmseg.segment(folder / 'trial_01.csv', folder / 'task.toml', folder / 'rig.toml')\nfound",
-         "found[0]", "print(f'{identified[0]}')", "found[0].plot()")  # fmt: skip
+         "found[0]", "print(f'{found[0]}')", "found[0].plot()")  # fmt: skip
 
 
 @pytest.mark.parametrize("package", PUBLIC, ids=lambda p: p.__name__)
@@ -346,5 +346,5 @@ def test_blocks_may_be_tables_or_an_identification_or_its_json(identified, tmp_p
     document = rough.to_json()
     document["properties"]["block2"]["height"] = None
     (tmp_path / "none.json").write_text(json.dumps(document))
-    line = r"block2\.height: identified None; expected a positive number in m"
+    line = r"block2\.height: found None; expected a positive number in m"
     refused(line, simgap.simulate, task, STACK / "rig.toml", tmp_path / "none.json")

@@ -203,13 +203,10 @@ def test_the_ends_of_a_carry_dropouts_and_missing_samples_are_left_out():
     third[carry.start + 2] += 3.6  # the first sample behind the trimmed two of forty
     properties, _ = estimate_plugin([replace(signals, fy1=third)], [segmentation], STACK)
     assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343 + 3.6 / 36)
-    state = np.where(np.abs(signals.fx1) > 1, np.where(signals.fy > 0, 2, 3), 1)
-    wild, gap = 2 * PER_SUBTASK + 10, 2 * PER_SUBTASK + 11
-    fy1 = signals.fy1.copy()
-    fy1[wild], fy1[gap] = 50.0, np.nan
-    state[[wild, gap]] = 0
-    labels = thresholds.StateLabels(state, np.zeros(state.size, dtype=bool))
-    properties, _ = estimate_plugin([replace(signals, fy1=fy1)], [segmentation], STACK, [labels])
+    wild, gap = carry.start + 10, carry.start + 11
+    fx1, fy1, fx2 = signals.fx1.copy(), signals.fy1.copy(), signals.fx2.copy()
+    fx1[wild], fx2[wild], fy1[wild], fy1[gap] = 0.0, 0.0, 50.0, np.nan  # no grip: not a state of holding
+    properties, _ = estimate_plugin([replace(signals, fx1=fx1, fy1=fy1, fx2=fx2)], [segmentation], STACK)
     assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343)
     assert properties["block1"]["friction"]["lower_bound"] == pytest.approx(0.3)
 
