@@ -45,13 +45,13 @@ class Proposal:
     def log_density(self, x: np.ndarray) -> np.ndarray:
         """Log density (num,) of proposing x (num, 6)."""
         z = np.linalg.solve(self.chol, (x[:, :NUM_CHANNELS] - self.mean).T)
-        out = _log_student((z**2).sum(axis=0), TAIL, NUM_CHANNELS) - np.log(np.diag(self.chol)).sum()
+        out = _log_student((z**2).sum(axis=0), NUM_CHANNELS) - np.log(np.diag(self.chol)).sum()
         scatter = x[:, NUM_CHANNELS:]
         cell = np.floor((scatter - REACH[0]) / STEP).astype(int)
         inside = (cell >= 0) & (cell < self.cells.shape[1])
         drawn = self.cells[np.arange(NUM_CHANNELS), np.where(inside, cell, 0)] / STEP
         z2 = (scatter / priors.SCATTER_LOG_SD) ** 2
-        prior = np.exp(_log_student(z2, TAIL, 1)) / priors.SCATTER_LOG_SD
+        prior = np.exp(_log_student(z2, 1)) / priors.SCATTER_LOG_SD
         return out + np.log((1 - FROM_PRIOR) * np.where(inside, drawn, 0.0) + FROM_PRIOR * prior).sum(axis=1)
 
 
@@ -69,10 +69,10 @@ def proposal(post: Posterior, mode: Mode) -> Proposal:
     return Proposal(mode.scales[:NUM_CHANNELS], np.linalg.cholesky(noise), found)
 
 
-def _log_student(z2: np.ndarray, tail: float, dim: int) -> np.ndarray:
-    """Log density of a t of unit scale in `dim` dimensions, from squared distances."""
-    constant = gammaln((tail + dim) / 2) - gammaln(tail / 2) - dim / 2 * np.log(tail * np.pi)
-    return constant - (tail + dim) / 2 * np.log1p(z2 / tail)
+def _log_student(z2: np.ndarray, dim: int) -> np.ndarray:
+    """Log density of a t of unit scale, TAIL and `dim` dimensions, from squared distances."""
+    constant = gammaln((TAIL + dim) / 2) - gammaln(TAIL / 2) - dim / 2 * np.log(TAIL * np.pi)
+    return constant - (TAIL + dim) / 2 * np.log1p(z2 / TAIL)
 
 
 INDEPENDENT = 0.9  # numerics: share of independence proposals

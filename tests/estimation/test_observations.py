@@ -3,22 +3,14 @@
 import numpy as np
 import pytest
 from estimation_scene import ar1
+from hand_signals import signals_of
 
 from estimation import observations
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
-from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
 from hmmseg.levels import TAIL
 from hmmseg.segmentation.align import TrialAlignment
 from hmmseg.segmentation.boundaries import BoundaryPosterior
-
-
-def made_signals(t, **columns):
-    names = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
-    zero = np.zeros(t.size)
-    spread = {name: zero for name in ("sd_x", "sd_y", "sd_vx", "sd_vy")}
-    values = {name: np.broadcast_to(np.asarray(columns.get(name, 0.0), float), t.shape) for name in names}
-    return Signals(t=t, **values, **spread, sd_force=0.0)
 
 
 def test_robust_weights_are_those_of_the_student_location_and_zero_without_residuals():
@@ -114,7 +106,7 @@ def test_pads_give_is_taken_out_and_gravity_grows_by_the_acceleration():
     rig = Rig(fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))
     t = np.arange(6) * 0.05
     # A block 20 mm wide held with 2 N: each pad gives 0.5 mm; its weight of 0.5 N shears both pads.
-    signals = made_signals(t, x1=0.1005, x2=0.1195, fx1=2.0, fx2=-2.0, y1=0.05, y2=0.05, fy1=0.25, fy2=0.25)
+    signals = signals_of(t, x1=0.1005, x2=0.1195, fx1=2.0, fx2=-2.0, y1=0.05, y2=0.05, fy1=0.25, fy2=0.25)
     values = observations.channel_values(signals, rig)
     np.testing.assert_allclose(values["distance"], 0.02)
     np.testing.assert_allclose(values["pickup"], 0.05 - 0.25 / 2500)
@@ -122,7 +114,7 @@ def test_pads_give_is_taken_out_and_gravity_grows_by_the_acceleration():
     np.testing.assert_allclose(rigid["distance"], 0.019)
     np.testing.assert_allclose(rigid["pickup"], 0.05)
     t = np.arange(30) * 0.05
-    signals = made_signals(t, vy1=2.0 * t, vy2=2.0 * t)
+    signals = signals_of(t, vy1=2.0 * t, vy2=2.0 * t)
     np.testing.assert_allclose(observations.gravity_factor(signals, Rig()), 1 + 2.0 / 9.80665)
 
 

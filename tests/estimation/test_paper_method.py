@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hand_signals import signals_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refused
@@ -14,7 +15,6 @@ from refusals import refused
 from estimation.paper_formulas import estimate_plugin
 from experiments.score_recordings import first_change_order
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, subtasks
-from hmmseg.errors import InputError
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask, Move, SequenceTask
 from hmmseg.io.trial import Trial
@@ -41,12 +41,9 @@ RESTS = {"stack": ((HEIGHT["block2"], 0.0), (0.0, HEIGHT["block1"])),
 
 
 def make_signals(states: str, dt: float = 0.05) -> Signals:
-    columns = np.array([PATTERNS[s] for s in states]).T
-    fx1, fy1, fx2, fy2, vx, vy = columns
-    zero = np.zeros(len(states))
-    return Signals(t=np.arange(len(states)) * dt, x1=zero, y1=zero, vx1=vx, vy1=vy, fx1=fx1, fy1=fy1,
-                   x2=zero + 0.02, y2=zero, vx2=vx, vy2=vy, fx2=fx2, fy2=fy2, sd_x=zero, sd_y=zero,
-                   sd_vx=zero, sd_vy=zero, sd_force=0.01)  # fmt: skip
+    fx1, fy1, fx2, fy2, vx, vy = np.array([PATTERNS[s] for s in states]).T
+    return signals_of(np.arange(len(states)) * dt, 0.01, fx1=fx1, fy1=fy1, fx2=fx2, fy2=fy2, vx1=vx, vy1=vy,
+                      vx2=vx, vy2=vy, x2=0.02)  # fmt: skip
 
 
 def segment(states: str, task, **options):
@@ -64,19 +61,14 @@ def starts(segmentation) -> list[float]:
     ("3", {"vy1": 0.06, "vy2": 0.06}, {}, 0), ("3", {"fy2": 0.3}, {}, 2),
     ("2", {}, {"force_threshold": 0.5}, 0), ("1", {"fx1": 0.05, "fx2": -0.05}, {}, 1),
     ("1", {"fx1": 0.06}, {}, 0), ("2", {}, {"force_threshold": 0.5, "velocity_threshold": 0.15}, 3),
-])  # fmt: skip
+    # A missing sample matters only where its signal is needed.
+    ("1", {"fy2": np.nan}, {}, 0), ("2", {"fx1": np.nan}, {}, 0), ("2", {"fy1": np.nan}, {}, 0),
+    ("2", {"vy1": np.nan}, {}, 2), ("3", {"vy2": np.nan}, {}, 0), ("3", {"vx1": np.nan}, {}, 3),
+    ("s", {"vx1": np.nan}, {}, 3)])  # fmt: skip
 def test_rules_ask_for_every_component_beyond_its_threshold(state, change, options, expected):
     signals = replace(make_signals(state), **{name: np.array([value]) for name, value in change.items()})
-    assert thresholds.label_states(signals, **options).state[0] == expected
-
-
-@pytest.mark.parametrize("state, name, expected", [
-    ("1", "fy2", 0), ("2", "fx1", 0), ("2", "fy1", 0), ("2", "vy1", 2), ("3", "vy2", 0),
-    ("3", "vx1", 3), ("s", "vx1", 3)])  # fmt: skip
-def test_missing_sample_is_unidentified_only_where_its_signal_is_needed(state, name, expected):
-    signals = replace(make_signals(state), **{name: np.array([np.nan])})
-    labels = thresholds.label_states(signals)
-    assert labels.state[0] == expected and not labels.sliding[0]
+    labels = thresholds.label_states(signals, **options)
+    assert labels.state[0] == expected and (options or not labels.sliding[0])
 
 
 def test_clean_sequence_has_its_boundaries_half_way_between_samples():
@@ -134,8 +126,9 @@ def test_a_move_that_never_happens_fails_at_its_pickup_though_a_grip_flickers():
 
 
 def test_refused_input():
-    with pytest.raises(InputError, match=r"--force-threshold: found 0\.0; expected a number > 0"):
-        segment("111", PICK, force_threshold=0.0)
+    refused(
+        r"--force-threshold: found 0\.0; expected a number > 0", segment, "111", PICK, force_threshold=0.0
+    )
     refused("--velocity-threshold: found nan", segment, "111", PICK, velocity_threshold=math.nan)
     refused("plain ordered task", segment, "111", SequenceTask(("a", "b")))
 
@@ -168,10 +161,7 @@ def make(task: BlockTask, rests, seed: int | None = None) -> tuple[Signals, Segm
     steps = subtasks(task)
     size = PER_SUBTASK * len(steps)
     t = np.arange(size) * 0.05
-    zero = {name: np.zeros(size) for name in ("x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
-    s = Signals(t=t, **zero, **{n: np.zeros(size) for n in ("vx1", "vy1", "vx2", "vy2")},
-                **{f"sd_{n}": np.zeros(size) for n in ("x", "y", "vx", "vy")}, sd_force=0.01)  # fmt: skip
-    spans = []
+    s, spans = signals_of(t, 0.01), []
     for i, step in enumerate(steps):
         inside = slice(i * PER_SUBTASK, (i + 1) * PER_SUBTASK)
         start, end = t[inside][0] - 0.025, t[inside][-1] + 0.025
@@ -213,13 +203,10 @@ def test_the_ends_of_a_carry_dropouts_and_missing_samples_are_left_out():
     third[carry.start + 2] += 3.6  # the first sample behind the trimmed two of forty
     properties, _ = estimate_plugin([replace(signals, fy1=third)], [segmentation], STACK)
     assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343 + 3.6 / 36)
-    state = np.where(np.abs(signals.fx1) > 1, np.where(signals.fy > 0, 2, 3), 1)
-    wild, gap = 2 * PER_SUBTASK + 10, 2 * PER_SUBTASK + 11
-    fy1 = signals.fy1.copy()
-    fy1[wild], fy1[gap] = 50.0, np.nan
-    state[[wild, gap]] = 0
-    labels = thresholds.StateLabels(state, np.zeros(state.size, dtype=bool))
-    properties, _ = estimate_plugin([replace(signals, fy1=fy1)], [segmentation], STACK, [labels])
+    wild, gap = carry.start + 10, carry.start + 11
+    fx1, fy1, fx2 = signals.fx1.copy(), signals.fy1.copy(), signals.fx2.copy()
+    fx1[wild], fx2[wild], fy1[wild], fy1[gap] = 0.0, 0.0, 50.0, np.nan  # no grip: not a state of holding
+    properties, _ = estimate_plugin([replace(signals, fx1=fx1, fy1=fy1, fx2=fx2)], [segmentation], STACK)
     assert properties["block1"]["weight"]["mean"] == pytest.approx(0.343)
     assert properties["block1"]["friction"]["lower_bound"] == pytest.approx(0.3)
 

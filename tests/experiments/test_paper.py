@@ -1,16 +1,21 @@
-"""The paper's reproduction: results come from the data, and the page says what the results say."""
+"""The paper's reproduction: results from the data, a page that says them; real recordings."""
 
 import json
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from refusals import refused
 
 from experiments.paper import estimates, recording, rigid, slip, sources, tables, write_docs
+from experiments.paper.paper_gap import rigid as with_rigid_pads
+from experiments.paper.sources import recorded
+from experiments.real import hiro_snap
 from experiments.saving import commit_of
 from hmmseg.plot import style as drawing
 from paper_figs import __main__ as figures
 from paper_figs import results
+from paper_figs.results import RESULTS
 
 
 @pytest.fixture(scope="module")
@@ -98,3 +103,33 @@ def test_figures_draw_from_saved_results(name, monkeypatch, tmp_path):
     monkeypatch.setattr(drawing, "DPI", 40)
     figures.FIGURES[name]()
     assert imread(tmp_path / f"{name}.png").std() > 0.02
+
+
+def test_snap_trials_are_read_and_cropped_or_refused(shared, tmp_path):
+    trials = hiro_snap.read_kind(shared / "real/hiro_snap", "real_guarded")
+    assert len(trials) == 7
+    trial, labels = trials[0]
+    assert trial.rate == pytest.approx(200, rel=0.01)
+    assert set(hiro_snap.WRENCH_AND_POSE) <= set(trial.channels)
+    np.testing.assert_allclose(labels, [7.075, 15.385, 16.325])
+    assert hiro_snap.cropped(trial, 2.0).t[0] == pytest.approx(2.0, abs=0.006)
+    refused(r"R_Torques.dat: cannot be read", hiro_snap.read_trial, tmp_path)
+    for name in ("R_Torques.dat", "R_CartPos.dat", "R_State.dat"):
+        (tmp_path / name).write_text("0 1 2\n1 2 3\n")
+    refused("has 3 columns; expected t and six more", hiro_snap.read_trial, tmp_path)
+
+
+def test_the_published_case_of_rigid_fingertips_blames_the_pads_and_no_slip():
+    rig = recorded().rig
+    assert np.isinf(with_rigid_pads(rig).fingertip.normal_stiffness)
+    assert with_rigid_pads(rig).fingertip.shear_stiffness == rig.fingertip.shear_stiffness
+    saved = json.loads((RESULTS / "gap.json").read_text())
+    for name in ("rigid", "rigid_with_actual"):
+        entry = saved[name]
+        assert (entry["verdict"], entry["causes"]) == ("named", ["fingertip_compliance"])
+        assert entry["slip_probability"] < 0.01
+        for block in ("block1", "block2"):
+            width = entry["properties"][f"{block}.width"]
+            assert width["before_error"] == pytest.approx(-1.3e-3, abs=0.2e-3)
+            assert abs(width["after_error"]) < 5e-5
+    assert saved["nominal"]["verdict"] == "none"

@@ -1,10 +1,13 @@
-"""Whatever a reader is given, it gives a result or one line, and nothing is half-written."""
+"""Whatever a reader or a cache is given: a result or one line, nothing half-written."""
 
 import io
 import json
 import math
 import os
 import pickle
+import subprocess
+import sys
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -15,6 +18,8 @@ from hypothesis import strategies as st
 from refusals import refused
 
 from experiments.fuzz import run
+from hmmseg import cache
+from hmmseg.cache import CacheWarning, cache_folder, keep, kept
 from hmmseg.errors import InputError
 from hmmseg.example import example_folder
 from hmmseg.hand.read import read_trial
@@ -33,8 +38,7 @@ from simgap.world.properties import read_properties
 TASK = parse_task({"objects": {"a": {"on": "ground"}}, "moves": [{"object": "a", "to": "ground"}]})
 READERS = {"trial": lambda path: read_trial(path, parse_rig({})),
            "model": lambda path: load_model(path, parse_task({"sequence": ["a", "b"]})), "rig": read_rig,
-           "task": read_task, "operator": read_operator,
-           "properties": lambda path: read_properties(path, TASK)}  # fmt: skip
+           "task": read_task}  # fmt: skip
 STACK = Path(__file__).parents[1] / "data/stack"
 MOVES = (example_folder() / "task.toml").read_text(encoding="utf-8")
 SOME = settings(max_examples=int(os.environ.get("HMMSEG_EXAMPLES", "60")), deadline=None,
@@ -130,38 +134,19 @@ def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("task.toml").write_text(MOVES)
     Path("bad.csv").write_text("t,x1\n0,zero\n")
+    rows = (STACK / "trial_01.csv").read_text().splitlines()
+    Path("half.csv").write_text("\n".join(rows[: len(rows) // 3]) + "\n")
     before = sorted(tmp_path.rglob("*"))
     hand = ["--task", "task.toml", "--rig", str(STACK / "rig.toml")]
-    for command in (["segment", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--write", "w"],
+    for command in (["simulate", *hand, "--replay", "half.csv", "--output", "made"],
+                    ["segment", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--write", "w"],
                     ["identify", "bad.csv", *hand, "--json", "a.json", "--figures", "f", "--report",
                      "r.html"], ["inspect", "bad.csv", "--write", "bad.toml", "--json", "a.json"],
                     ["simulate", *hand, "--properties", "bad.csv", "--output", "s"]):  # fmt: skip
         assert main(command) == 2
-        lines = capsys.readouterr().err.strip().splitlines()
-        assert len(lines) == 1, lines
+        half, lines = "half.csv" in command, capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 + half and ("not show the whole task" in lines[-1]) == half, lines
         assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_a_recording_that_stops_halfway_is_no_replay(tmp_path, capsys):
-    (tmp_path / "task.toml").write_text(MOVES)
-    rows = (STACK / "trial_01.csv").read_text().splitlines()
-    (tmp_path / "half.csv").write_text("\n".join(rows[: len(rows) // 3]) + "\n")
-    hand = ["--task", str(tmp_path / "task.toml"), "--rig", str(STACK / "rig.toml")]
-    before = sorted(tmp_path.rglob("*"))
-    replay = ["--replay", str(tmp_path / "half.csv"), "--output", str(tmp_path / "made")]
-    assert main(["simulate", *hand, *replay]) == 2
-    assert "does not show the whole task" in capsys.readouterr().err and sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize(("read", "content"), [
-    *(("operator", text) for text in ("[1]", "3", "[" * 100_000, '{"pace": []}', '{"pace": {"a": 1}}')),
-    *(("properties", text) for text in ("[1]", "{}", '{"properties": 3}', "[" * 100_000)),
-    ("properties", '{"properties": {"a": []}}'),
-], ids=lambda value: value[:20])  # fmt: skip
-def test_documents_that_are_none(read, content, tmp_path):
-    path = tmp_path / "made.json"
-    path.write_text(content)
-    assert str(path) in refused("", READERS[read], path)
 
 
 @pytest.mark.parametrize("read", ["trial", "model"])
@@ -248,18 +233,11 @@ def test_streams(lines):
     for _ in range(len(text) + 50):  # bytes may hold line ends
         row = one_line(rows.next)
         if row is not None:
-            strict(watcher.update(*row).line())
+            json.loads(watcher.update(*row).line(), parse_constant=pytest.fail)
     final = one_line(watcher.finish)
     assert (final is None) == (not watcher.counts["rows"])
     if final is not None:
-        strict(final.line())
-
-
-def strict(line):
-    def refuse(constant):
-        raise AssertionError(f"{constant} in {line[:200]}")
-
-    return json.loads(line, parse_constant=refuse)
+        json.loads(final.line(), parse_constant=pytest.fail)
 
 
 @pytest.fixture(scope="module")
@@ -298,3 +276,102 @@ def test_models(folder, model, edits):
 def test_a_model_with_any_one_number_impossible(folder, model, value):
     for k in range(len(model[1])):
         check_model(folder, model, [(k, value)])
+
+
+PROGRAM = """
+import sys
+from hmmseg.jaxconfig import configure, double_precision
+configure()
+import jax, jax.numpy as jnp
+jax.monitoring.register_event_listener(lambda event, **_: print(event) if "cache_" in event else None)
+print(double_precision(lambda: jax.jit(lambda x: (x * x).sum())(jnp.arange(5.0)))())
+"""
+FUNCTION = """
+from hmmseg.online.compiled import compiled
+@compiled
+def double(x):
+    return 2 * x
+print(double(1.5), sum(double.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture(autouse=True)
+def unsaid(monkeypatch):
+    monkeypatch.setattr(cache, "_said", set())
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "garbled", "foreign", "pickle", "folder", "swapped"])
+def test_a_damaged_file_is_said_once_and_made_anew(damage, tmp_path):
+    path, other = tmp_path / "new/one.json", tmp_path / "new/other.json"
+    for each in (path, other):
+        keep(each, b"\x00[1, 2]\xff")
+        assert kept(each) == b"\x00[1, 2]\xff"
+        content = bytearray(each.read_bytes())
+        middle = len(content) // 2
+        content[middle] ^= 0x10
+        each.unlink()
+        if damage == "folder":
+            each.mkdir()
+            continue
+        each.write_bytes({
+            "empty": b"", "cut": bytes(content[:middle]), "garbled": bytes(content), "foreign": b"\xff" * 99,
+            "pickle": pickle.dumps([1, 2]), "swapped": cache.MAGIC + bytes(32),
+        }[damage])  # fmt: skip
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        assert kept(path) is kept(other) is None
+    assert [w.category for w in said] == ([] if damage == "folder" else [CacheWarning])
+    keep(path, b"3")
+    assert kept(path) == (None if damage == "folder" else b"3")
+    assert {"one.json"} <= {*os.listdir(tmp_path / "new")} <= {"one.json", "other.json"}
+
+
+@pytest.mark.parametrize("where", ["/proc/nowhere", "a file", "relative", ""])
+def test_without_a_home_nothing_is_kept_and_nothing_fails(where, tmp_path, monkeypatch):
+    (tmp_path / "a file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / where) if where == "a file" else where)
+    monkeypatch.setenv("HOME", "/proc/nowhere")
+    folder = cache_folder()
+    keep(folder / "one.json", b"1")
+    assert kept(folder / "one.json") is None and os.listdir(tmp_path) == ["a file"]
+
+
+def test_compiled_programs_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": ""}
+
+    def run():
+        done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True,
+                              text=True)  # fmt: skip
+        assert done.stdout.endswith("30.0\n")
+        return "cache_hits" in done.stdout, done.stderr
+
+    (tmp_path / "hmmseg").write_text("")
+    assert run() == (False, "")  # there is nowhere to keep them
+    (tmp_path / "hmmseg").unlink()
+    assert run() == (False, "")
+    programs = list((tmp_path / "hmmseg/programs").iterdir())
+    for program in programs:
+        content = bytearray(program.read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        program.write_bytes(content)
+    hit, said = run()
+    assert programs and not hit and said.count("not as it was written") == 1 and run() == (True, "")
+
+
+def test_functions_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
+    program, environment = tmp_path / "program.py", {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    program.write_text(FUNCTION)
+    environment.pop("NUMBA_CACHE_DIR", None)
+
+    def run():
+        done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True)
+        return done.stdout.strip(), "not as it was written" in done.stderr
+
+    assert run() == ("3.0 0", False) and run() == ("3.0 1", False)
+    for kind in "nbi", "nbc":
+        (file,) = (tmp_path / "hmmseg/numba").rglob(f"*.{kind}")
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 0xFF
+        file.write_bytes(content)
+        assert run() == ("3.0 0", True) and run() == ("3.0 1", False)

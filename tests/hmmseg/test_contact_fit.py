@@ -16,16 +16,7 @@ from hmmseg.io.task import BlockTask, Move
 from hmmseg.levels import MOVED, TAIL
 from hmmseg.segmentation import fit as contact_fit
 from hmmseg.segmentation.emissions import RUNG, Features, Parameters, _log_ungripped, log_likelihoods
-from hmmseg.segmentation.fit import (
-    _least_force,
-    _location,
-    _scale,
-    chain_of,
-    fit,
-    initial_parameters,
-    mean_shares,
-    otsu,
-)
+from hmmseg.segmentation.fit import fit
 
 STACK = BlockTask({"block1": "block2", "block2": "ground"},
                   (Move("block1", "ground"), Move("block2", "block1")))  # fmt: skip
@@ -216,8 +207,8 @@ def test_otsu_against_trying_every_split():
             return low.size * high.size * (high.mean() - low.mean()) ** 2
 
         best = max(range(1, v.size), key=between)
-        assert otsu(rng.permutation(values)) == pytest.approx((v[best - 1] + v[best]) / 2)
-    assert otsu(np.array([0.0, np.nan, 1.0, 1.1, 0.1])) == pytest.approx(0.55)
+        assert contact_fit.otsu(rng.permutation(values)) == pytest.approx((v[best - 1] + v[best]) / 2)
+    assert contact_fit.otsu(np.array([0.0, np.nan, 1.0, 1.1, 0.1])) == pytest.approx(0.55)
 
 
 def test_location_and_scale_maximise_the_weighted_student_likelihood():
@@ -228,27 +219,27 @@ def test_location_and_scale_maximise_the_weighted_student_likelihood():
         return -weights @ stats.t.logpdf(values, TAIL, loc=p[0], scale=np.exp(p[1]))
 
     at_scale = optimize.minimize_scalar(lambda m: loss([m, np.log(0.2)]), bounds=(2, 4), method="bounded")
-    assert _location(values, weights, 0.2, 2.5) == pytest.approx(at_scale.x, abs=2e-3)
+    assert contact_fit._location(values, weights, 0.2, 2.5) == pytest.approx(at_scale.x, abs=2e-3)
     # The pull towards the start has the weight of one sample of about 200.
     at_location = optimize.minimize_scalar(lambda s: loss([3.0, s]), bounds=(-4, 0), method="bounded")
     found = 0.5
     for _ in range(20):
-        found = _scale(values - 3.0, weights, found, 1e-6)
+        found = contact_fit._scale(values - 3.0, weights, found, 1e-6)
     assert found == pytest.approx(np.exp(at_location.x), rel=0.02)
 
 
 def test_shares_are_the_mean_of_their_dirichlet_and_transitions_have_the_mean_duration():
-    stay, advance = chain_of(np.array([0.25, 0.5, 0.25]), 200).bands
+    stay, advance = contact_fit.chain_of(np.array([0.25, 0.5, 0.25]), 200).bands
     np.testing.assert_allclose(np.exp(stay[:2]) + np.exp(advance), 1.0)
     np.testing.assert_allclose(np.exp(-advance), [50, 100])
-    stay, advance = chain_of(np.array([1e-9, 1.0]), 5).bands
+    stay, advance = contact_fit.chain_of(np.array([1e-9, 1.0]), 5).bands
     assert np.isfinite(stay).all() and np.isfinite(advance).all()
     rng = np.random.default_rng(5)
     gammas = [rng.dirichlet(np.ones(4), size=n) * [1, 1, 1, 0] for n in (30, 50)]  # a subtask nobody saw
     gammas = [g / g.sum(axis=1, keepdims=True) for g in gammas]
     counts = sum(g.mean(axis=0) for g in gammas)
     expected = stats.dirichlet(np.full(4, 1 / 4) + counts).mean()
-    found = mean_shares(gammas)
+    found = contact_fit.mean_shares(gammas)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     assert found[3] > 0
 
@@ -268,10 +259,10 @@ def check_recovery(found, trials):
 
 @pytest.mark.parametrize("wrong", ["nothing", "weights", "scales", "biases"])
 def test_planted_parameters_are_recovered_from_wrong_starts(wrong, monkeypatch):
-    trials = [planted(seed) for seed in range(2)]
+    trials, usual = [planted(seed) for seed in range(2)], contact_fit.initial_parameters
 
     def start(features, steps):
-        right = initial_parameters(features, steps)
+        right = usual(features, steps)
         if wrong == "weights":
             return replace(right, weight={"block1": 0.9, "block2": 0.12})
         if wrong == "scales":
@@ -287,11 +278,11 @@ def test_a_scale_is_not_learned_from_readings_that_rounding_makes_equal():
     step = 5 * PLANTED.noise
     rounded = replace(trial, force=step * np.round(trial.force / step))
     assert np.mean(rounded.force[labels == 0] == 0) > 0.9
-    assert _least_force([rounded]) == pytest.approx(step / np.sqrt(12))
+    assert contact_fit._least_force([rounded]) == pytest.approx(step / np.sqrt(12))
     found = fit([rounded], STEPS)
     assert found.parameters.scale["force"] == pytest.approx(step / np.sqrt(12))
     assert np.mean(np.asarray(found.posteriors[0].path) == labels) > 0.95
-    assert _least_force([trial]) < 0.3 * PLANTED.noise
+    assert contact_fit._least_force([trial]) < 0.3 * PLANTED.noise
 
 
 def learn_level(trials, start, **settings):

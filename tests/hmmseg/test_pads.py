@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hand_signals import signals_of
 from scipy.signal import lfilter
 
 from experiments.worlds import WORLDS, Cell, World, scene, trials_of
-from hmmseg.hand.signals import Signals
 from hmmseg.segmentation.align import segment
 from hmmseg.segmentation.emissions import Parameters
 from hmmseg.segmentation.pads import (
@@ -102,11 +102,9 @@ def test_recorded_lag_is_found_and_said_and_healthy_forces_are_on_time():
 
 def test_reading_again_undoes_what_was_found_and_smears_no_jump():
     t = np.arange(0, 1, 0.01)
-    ramp, zero = np.clip(t - 0.3, 0, 0.4), np.zeros(t.size)
+    ramp = np.clip(t - 0.3, 0, 0.4)
     late = np.interp(t - 0.05, t, ramp)
-    known = dict.fromkeys(("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2"),
-                          late)  # fmt: skip
-    signals = Signals(t, **known, sd_x=zero, sd_y=zero, sd_vx=zero, sd_vy=zero, sd_force=0.01)
+    signals = signals_of(t, 0.01, x1=late, fx1=late, fx2=late)
     pad = Compliance(2.5e-4, 1e-6, 0.05)
     again = read_again(signals, Sensing(pad, pad, 0.05, 0.001, late=True))
     np.testing.assert_allclose(again.fx1[:94], ramp[:94], atol=1e-12)
@@ -125,9 +123,7 @@ def test_friction_is_the_steepest_ratio_that_a_contact_shows_for_sure():
     t = np.arange(40) * 0.02
     grip = np.clip(4.0 - t / 0.2, 0.0, None)
     shear = np.minimum(1.2, 0.8 * grip)  # slides from 1.5 N on
-    still = ("x1", "y1", "vx1", "vy1", "x2", "y2", "vx2", "vy2", "sd_x", "sd_y", "sd_vx", "sd_vy")
-    signals = Signals(t=t, fx1=grip, fy1=-shear, fx2=-grip, fy2=0.5 * shear, sd_force=0.01,
-                      **dict.fromkeys(still, np.zeros_like(t)))  # fmt: skip
+    signals = signals_of(t, 0.01, fx1=grip, fy1=-shear, fx2=-grip, fy2=0.5 * shear)
     parameters = Parameters(np.zeros(4), {"a": 1.0}, {"force": 0.01})
     one, two = steepest(signals, 0.0, 0.8, parameters)
     assert one == pytest.approx(0.8, abs=0.06) and one < 0.8 and two == pytest.approx(0.4, abs=0.06)
@@ -154,28 +150,19 @@ def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE
     return Squeeze(t, seen, rate, read, 2.8e-5, 0.017)
 
 
-@pytest.mark.parametrize("step", [0.02, 0.05])
-@pytest.mark.parametrize("delay", [0.03, 0.06, 0.2])
-def test_a_delay_is_found(delay, step):
-    found = lateness([whole_grip(delay, step=step, seed=i) for i in range(4)], PRIOR)
-    assert found.late and not found.filter and found.delay == pytest.approx(delay, abs=0.006)
+@pytest.mark.parametrize(("delay", "constant", "step"), [
+    *((delay, 0.0, step) for delay in (0.03, 0.06, 0.2) for step in (0.02, 0.05)), (0.0, 0.03, 0.02),
+    (0.0, 0.06, 0.02)])  # fmt: skip
+def test_a_delay_or_a_filter_is_found_and_they_are_told_apart(delay, constant, step):
+    found = lateness([whole_grip(delay, constant, step, seed=i) for i in range(4)], PRIOR)
+    assert found.late and found.filter == (constant > 0)
+    assert found.delay == pytest.approx(delay + constant, abs=0.006 + 0.2 * constant * (constant > 0))
 
 
-@pytest.mark.parametrize("constant", [0.03, 0.06])
-def test_a_filter_is_found_and_told_from_a_delay(constant):
-    found = lateness([whole_grip(constant=constant, seed=i) for i in range(4)], PRIOR)
-    assert found.late and found.filter and found.delay == pytest.approx(constant, rel=0.2)
-
-
-@pytest.mark.parametrize("prior", [PRIOR, (0.0, 2e-4)])
-def test_forces_on_time_are_not_late(prior):
-    found = lateness([whole_grip(seed=i) for i in range(4)], prior)
-    assert not found.late and abs(found.delay) < max(3 * found.sd, 1e-3)
-
-
-@pytest.mark.parametrize("delay", [-0.004, 0.004])
-def test_a_small_delay_is_found_and_is_no_sensor_s(delay):
-    found = lateness([whole_grip(delay, seed=i) for i in range(6)], PRIOR)
+@pytest.mark.parametrize(("delay", "prior"), [(0.0, PRIOR), (0.0, (0.0, 2e-4)), (-0.004, PRIOR),
+                                              (0.004, PRIOR)])  # fmt: skip
+def test_a_small_delay_is_found_and_is_no_sensor_s(delay, prior):
+    found = lateness([whole_grip(delay, seed=i) for i in range(6)], prior)
     assert not found.late and found.delay == pytest.approx(delay, abs=max(3 * found.sd, 1e-3))
 
 

@@ -1,17 +1,24 @@
-"""Trials of every kind, of other labs' columns and text tables; every one refused with its message."""
+"""Trials, rigs and tasks of every layout, each refused with its message; tasks decomposed against physics."""
+
+import math
+from fractions import Fraction
 
 import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from refusals import refused
+from scipy.linalg import null_space
 
-from hmmseg.errors import InputError
+from hmmseg.contact import decompose as decomposing
+from hmmseg.contact.decompose import Source, decompose, determined, height_equations
 from hmmseg.hand.read import read_trial
 from hmmseg.hand.signals import task_space
 from hmmseg.io.formats import read_table
-from hmmseg.io.rig import parse_rig
-from hmmseg.io.task import SequenceTask
+from hmmseg.io.rig import Rig, parse_rig, read_rig
+from hmmseg.io.task import GROUND, BlockTask, Move, SequenceTask, parse_task, read_task
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS
 from hmmseg.io.units import UNITS, known_unit, measures, si_factor, unit_in_name
 
@@ -107,12 +114,11 @@ def test_a_plain_task_has_its_own_or_mapped_channels_and_refuses_others():
     frame = table(("fx", "fy", "note"))
     assert set(read_trial(frame, task=PLAIN).channels) == {"fx", "fy", "note"}
     assert set(read_trial(frame, task=SequenceTask(("a",), channels=("fy",))).channels) == {"fy"}
-    with pytest.raises(InputError, match="DataFrame: has no columns but t; expected at least one channel"):
-        read_trial(table(()), task=PLAIN)
-    with pytest.raises(InputError, match="DataFrame: column fz: missing; expected one of fx, fy, t"):
-        read_trial(table(("fx", "fy")), task=SequenceTask(("a",), channels=("fz",)))
-    with pytest.raises(ValueError, match="a block task's trial needs its rig"):
-        read_trial(table())
+    line = "DataFrame: has no columns but t; expected at least one channel"
+    refused(line, read_trial, table(()), task=PLAIN)
+    refused("DataFrame: column fz: missing; expected one of fx, fy, t", read_trial, table(("fx", "fy")),
+            task=SequenceTask(("a",), channels=("fz",)))  # fmt: skip
+    refused("a block task's trial needs its rig", read_trial, table(), error=ValueError)
     theirs = {"stamp": np.arange(10) * 20.0, "F": np.arange(10.0), "other": np.ones(10)}
     rig = parse_rig({"columns": {"t": {"from": "stamp", "unit": "ms"}, "force": {"from": "F", "unit": "mN"}}})
     trial = read_trial(theirs, rig, PLAIN)
@@ -193,8 +199,8 @@ def test_files_refused(tmp_path):
     refused(r"folder\.csv: is a folder; expected a trial", read_trial, tmp_path / "folder.csv", JOINTED)
     refused(r"absent\.csv: no such file; expected a trial", read_trial, tmp_path / "absent.csv", JOINTED)
     np.savez(tmp_path / "uneven.npz", t=np.arange(9), q11=np.arange(8))
-    with pytest.raises(InputError, match=r"uneven\.npz: column .*: has . rows; expected . as in the"):
-        read_trial(tmp_path / "uneven.npz", JOINTED)
+    line = r"uneven\.npz: column .*: has . rows; expected . as in the"
+    refused(line, read_trial, tmp_path / "uneven.npz", JOINTED)
     with (tmp_path / "one.npz").open("wb") as file:
         np.save(file, np.arange(9))
     refused(r"one\.npz: holds one array without a name; expected one array a column", read_trial,
@@ -223,10 +229,11 @@ def test_mapping_is_undone_by_units_sign_and_offset_and_fits_the_file():
     np.testing.assert_allclose(trial.t, ours["t"], atol=1e-12)
     for name in CARTESIAN_CHANNELS:
         np.testing.assert_allclose(trial.channels[name], ours[name], atol=1e-12, err_msg=name)
-    with pytest.raises(InputError, match=r"column left: missing, but the rig maps x1 to it; expected one of"):
-        read_trial(ours, parse_rig({"columns": {"x1": "left"}}))
-    with pytest.raises(InputError, match=r"\[columns\] xl: is no channel of this hand or task; .*mean"):
-        read_trial(ours, parse_rig({"columns": {"xl": "x1"}}))
+    for mapped, line in (
+        ({"x1": "left"}, "column left: missing, but the rig maps x1 to it; expected one of"),
+        ({"xl": "x1"}, r"\[columns\] xl: is no channel of this hand or task; .*mean"),
+    ):
+        refused(line, read_trial, ours, parse_rig({"columns": mapped}))
 
 
 def test_units():
@@ -341,3 +348,306 @@ def test_csv_refused_with_its_line(tmp_path, text, line, read):
     path = tmp_path / "a.csv"
     path.write_text(text)
     refused(rf"a\.csv: ({line})", read_trial, path, **read)
+
+
+FINGER = {"base": [0.05, 0.17], "links": [0.12, 0.12]}
+HAND = {"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.21, 0.17]}}}
+STACK = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
+SWAP = [{"object": "block1", "to": "ground"}, {"object": "block2", "to": "block1"}]
+BACK = [{"object": "a", "to": "b"}, {"object": "a", "to": "ground"}]
+GRIPPERS = [
+    ({"frame": "base"}, "key gripper.frame: "),
+    ({"wrench": ["fx"]}, "key gripper.wrench: has 1 columns; expected 3 forces"),
+    ({"mass": 1}, r"key gripper.mass: unknown key; .*tool_mass\?"),
+    ({"sensor_axes": ["x", "y", "-z"]}, ".*gripper.sensor_axes: x, y, -z are no right-handed axes"),
+    ({"position": {"x": "a", "y": "b"}}, ".*position has no column for z, the axis that is up"),
+    ({"force_per_ampere": 3.0}, ".*force_per_ampere without motor_current"),
+    ({"grip_force": 1e308}, "key gripper.grip_force")]  # fmt: skip
+
+
+def test_uncertainty_gripper_and_tolerance_are_read_and_what_is_left_out_has_its_default():
+    rig = parse_rig({})
+    assert rig == Rig() and not rig.jointed and rig.gravity == 9.80665
+    assert math.isinf(rig.fingertip.normal_stiffness) and rig.noise.force is None
+    refused("a Cartesian hand has no fingers", rig.finger, 1, error=ValueError)
+    rig = parse_rig({"systematic": {"force_bias": 0.01, "force_gain": [0.1, 0.2, 0.3, 0.4],
+                                    "joint_offset": {"q12": 0.002}, "pad_stiffness": 1}})  # fmt: skip
+    assert rig.systematic.force_bias == (0.01,) * 4 and rig.systematic.force_gain == (0.1, 0.2, 0.3, 0.4)
+    assert rig.systematic.joint_offset == (0.0, 0.002, 0.0, 0.0)
+    assert rig.systematic.pad_stiffness == (1.0, 1.0) and rig.systematic.link_length == (0.0,) * 4
+    rig = parse_rig({"tolerance": {"position": 1e-3}, "gripper": {"opening": "width", "tool_mass": 0.5}})
+    assert (rig.tolerance.position, rig.tolerance.property) == (1e-3, None)
+    assert rig.gripper.channels[:4] == ("x", "y", "z", "width") and rig.gripper.tool_mass == 0.5
+
+
+REFUSED_RIGS = [
+    ({"speed": 1}, r"key speed: unknown key; expected one of .*rate.* \(did you mean"),
+    ({"fingers": {"1": {**FINGER, "length": 1}, "2": FINGER}}, "key fingers.1.length: unknown key"),
+    ({"fingers": {"1": FINGER}}, r"fingers must be the two tables \[fingers.1\] and \[fingers.2\]"),
+    ({"fingers": {"1": FINGER, "2": {"base": [0, 0]}}}, "key fingers.2.links: missing"),
+    ({"fingers": {"1": FINGER, "2": {**FINGER, "links": [0.1, -0.1]}}}, "key .*2.links.1: .*greater than 0"),
+    ({"fingers": {"1": FINGER, "2": {**FINGER, "base": [0.1, math.nan]}}}, "key fingers.2.base.1: .*finite"),
+    ({"rate": 0}, r"key rate: Input should be greater than 0 \(found 0"),
+    ({"rate": True}, r"key rate: Input should be a valid number \(found True\)"),
+    ({"gravity": 980.665}, r"key gravity: .*less than or equal to 100"),
+    ({"fingers": {"1": FINGER, "2": {**FINGER, "links": [120, 120]}}}, "key .*2.links.0: .*equal to 10"),
+    ({"fingertip": {"normal_stiffness": math.nan}}, r"key fingertip.normal_stiffness: .*greater than 0"),
+    ({"noise": {"force": 0}}, r"key noise.force: .*greater than 0"),
+    ({"noise": 0.1}, r"key noise: .*dictionary"),
+    ({"systematic": {"force_bias": -0.1}}, r"key systematic.force_bias.0: .*greater than or equal to 0"),
+    ({"systematic": {"force_bias": [0.1, 0.1]}}, r"key systematic.force_bias.2: missing"),
+    ({"systematic": {"force_bias": [0.1] * 5}}, r"key systematic.force_bias: .*at most 4"),
+    ({"systematic": {"force_bias": {"fz1": 0.1}}}, "key systematic.force_bias: unknown entry fz1; .*mean f"),
+    ({"systematic": {"force_bias": True}}, r"key systematic.force_bias: must be a number"),
+    ({"systematic": {"force_bias": 10**400}}, r"key systematic.force_bias: must be at most 1e\+12"),
+    ({"noise": {"force": 1e300}}, r"key noise.force: .*less than or equal to"),
+    ({"columns": {"x1": {"from": "a", "unit": "furlong"}}}, "key columns.x1.unit: unknown unit 'furlong'"),
+    ({"columns": {"x1": {"from": "a", "sing": 1}}}, r"key columns.x1.sing: unknown key; .*mean sign\?"),
+    ({"columns": {"x1": {"from": "a", "sign": 2}}}, "key columns.x1.sign: found 2; expected 1 or -1"),
+    ({"columns": {"x1": {"from": ""}}}, "key columns.x1.from: .*at least 1 character"),
+    ({"columns": {"x1": 3}}, "key columns.x1: "),
+    ({"columns": {"x1": {"unit": -1.0}}}, "key columns.x1.unit"),
+    ({"columns": {"t": {"unit": "mm"}}}, "key columns: t is a time, but its unit mm is one of length"),
+    ({"columns": {"fx1": {"unit": "deg"}}}, "key columns: fx1 is a force, but its unit deg is one of angle"),
+    ({"gripper": {}}, r"a hand has \[fingers\] or is a \[gripper\], not both")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("table", "message"), [
+    *(({**HAND, **table}, message) for table, message in REFUSED_RIGS),
+    *(({"gripper": table}, message) for table, message in GRIPPERS)])  # fmt: skip
+def test_refused_with_its_message(table, message):
+    refused(f"^rig: {message}", parse_rig, table)
+
+
+def test_reads_blocks_moves_repeats_and_plain_sequences(tmp_path):
+    path = tmp_path / "task.toml"
+    path.write_text('[objects.block1]\non = "block2"\n[objects.block2]\non = "ground"\n'
+                    '[[moves]]\nobject = "block1"\nto = "ground"\n'
+                    '[[moves]]\nobject = "block1"\nto = "ground"\nslide = true\n')  # fmt: skip
+    task = read_task(path)
+    assert task == BlockTask({"block1": "block2", "block2": "ground"},
+                             (Move("block1", "ground"), Move("block1", "ground", slide=True)))  # fmt: skip
+    assert task.objects == ("block1", "block2")
+    table = {"objects": {"a": {"on": "ground"}, "b": {"on": "ground"}}, "moves": BACK, "repeat": 3}
+    task = parse_task(table)
+    assert isinstance(task, BlockTask) and task.performed == task.moves * 3
+    unknown = parse_task({**table, "repeat": "unknown"})
+    assert isinstance(unknown, BlockTask) and unknown.performed == unknown.moves
+    table = {"sequence": ["a", "b", "a"], "channels": ["fx"], "optional": ["b"]}
+    assert parse_task(table) == SequenceTask(("a", "b", "a"), ("fx",), ("b",))
+    assert parse_task({"sequence": ["a"]}) == SequenceTask(("a",))
+
+
+def blocks(objects=STACK, moves=SWAP, **more):
+    return {"objects": objects, "moves": moves, **more}
+
+
+def move(**entry):
+    return blocks(moves=[entry])
+
+
+@pytest.mark.parametrize(("table", "message"), [
+    (blocks(move=[]), r"key move: unknown key; expected one of .*, sequence \(did you mean moves\?\)"),
+    (blocks(sequence=["a"]), "key moves: does not go with `sequence`"),
+    (blocks(channels=["fx"]), "key channels: goes only with `sequence`"),
+    ({}, r"key objects: missing or empty; expected a table \[objects.NAME\] for every block"),
+    (blocks(objects=["block1"]), "key objects: missing or empty"),
+    ({"objects": STACK}, r"key moves: missing or empty; expected at least one \[\[moves\]\]"),
+    (blocks(moves={"object": "block1"}), "key moves: missing or empty"),
+    (blocks(objects={"ground": {"on": "ground"}}), "key objects.ground: 'ground' is always there"),
+    (blocks(objects={"finger1": {"on": "ground"}}), "key objects.finger1: 'finger1' is always there"),
+    (blocks(objects={"my block": {"on": "ground"}}), "key .*'my block' cannot be a name; expected letters"),
+    (blocks(objects={"a.b": {"on": "ground"}}), "key objects.a.b: 'a.b' cannot be a name"),
+    (blocks(objects={"a": {}}), "key objects.a.on: missing; expected what the object stands on"),
+    (blocks(objects={"a": "ground"}), "key objects.a.on: missing"),
+    (blocks(objects={"a": {"on": "ground", "mass": 1}}), "key objects.a.mass: unknown key"),
+    (blocks(objects={"a": {"on": "grund"}}), r"key objects.a.on: unknown object 'grund'; .*ground"),
+    (blocks(objects={"a": {"on": ["ground"]}}), r"key objects.a.on: unknown object \['ground'\]"),
+    (blocks(objects={"a": {"on": "a"}}), "key objects.a.on: objects stand on each other in a circle"),
+    (blocks(objects={"a": {"on": "b"}, "b": {"on": "a"}}), "key objects.a.on: .* in a circle"),
+    (blocks(objects={"a": {"on": "c"}, "b": {"on": "c"}, "c": {"on": "ground"}}), ".*c' already carries 'a"),
+    (blocks(repeat=0), 'key repeat: found 0; expected a whole number from 1 to 1000 or "unknown"'),
+    (blocks(repeat=True), "key repeat: found True"),
+    (blocks(repeat=10**9), "key repeat: found 1000000000"),
+    (blocks(moves=["block1"]), "move 1: found 'block1'; expected a table with object and to"),
+    (move(object="block1", too="ground"), "move 1: key too: unknown key; .*did you mean to"),
+    (move(object="block1"), "move 1: key to: missing or not a name; expected an object's name"),
+    (move(to="ground"), "move 1: key object: missing or not a name"),
+    (move(object=["block1"], to="ground"), "move 1: key object: missing or not a name"),
+    (move(object="block1", to="ground", slide=1), "move 1: key slide: found 1; expected true or false"),
+    (move(object="block3", to="ground"), "move 1: unknown object 'block3'; expected one of block1"),
+    (move(object="ground", to="block1"), "move 1: unknown object 'ground'"),
+    (move(object="block1", to="table"), "move 1: unknown destination 'table'; expected .*ground"),
+    (move(object="block1", to="block1"), "move 1: 'block1' cannot go onto itself"),
+    (move(object="block2", to="ground"), "move 1: 'block2' has 'block1' on it; expected a free object"),
+    (blocks({**STACK, "c": {"on": "ground"}}, [{"object": "c", "to": "block2"}]), ".*block2' already has"),
+    (blocks(moves=[*SWAP, {"object": "block1", "to": "ground"}]), "move 3: 'block1' has 'block2'"),
+    (move(object="block1", to="ground", slide=True), r"move 1: a slide stays on its support \('block2'\)"),
+    (blocks(repeat=2), r"move 1 \(repeat 2\): 'block1' has 'block2' on it"),
+    (blocks(repeat="unknown"), r"move 1 \(repeat 2\): 'block1' has 'block2' on it"),
+    ({"sequence": []}, "key sequence: is empty; expected at least one name"),
+    ({"sequence": "a"}, "key sequence: found 'a'; expected a list of names"),
+    ({"sequence": ["a", 2]}, r"key sequence: found \['a', 2\]; expected a list of names"),
+    ({"sequence": ["a", ""]}, "key sequence: found .*; expected a list of names"),
+    ({"sequence": ["a", "b", "b"]}, "key sequence: entries 2 and 3 are both 'b'; expected"),
+    ({"sequence": ["a"], "channels": []}, "key channels: empty or repeated"),
+    ({"sequence": ["a"], "channels": ["f", "f"]}, "key channels: empty or repeated; expected distinct"),
+    ({"sequence": ["a", "b"], "optional": ["c"]}, "key optional: 'c' is not in sequence; .* a, b"),
+    ({"sequence": ["a", "b"], "optional": ["a", "b"]}, "key optional: covers all of sequence"),
+])  # fmt: skip
+def test_a_task_refused_with_its_message(table, message):
+    refused(f"^task: {message}", parse_task, table)
+
+
+@pytest.mark.parametrize("read", [read_rig, read_task])
+def test_a_file_that_is_absent_or_malformed(read, tmp_path):
+    (tmp_path / "marked.toml").write_text('sequence = ["a", "b"]', encoding="utf-8-sig")  # by an editor
+    assert read_task(tmp_path / "marked.toml").sequence == ("a", "b")
+    (tmp_path / "bad.toml").write_text("moves = [")
+    (tmp_path / "latin.toml").write_bytes(b'sequence = ["\xe9"]')
+    for name, line in (("absent.toml", r"absent\.toml: no such file; expected a TOML file"),
+                       ("bad.toml", r"bad\.toml: not valid TOML: "),
+                       ("latin.toml", r"latin\.toml: cannot be read"), (".", "cannot be read")):  # fmt: skip
+        refused(line, read, tmp_path / name)
+
+
+PAPER = BlockTask({"block1": "block2", "block2": GROUND}, (Move("block1", GROUND), Move("block2", "block1")))
+TOWER = BlockTask({"a": "b", "b": "c", "c": GROUND},
+                  (Move("a", GROUND), Move("b", GROUND), Move("c", "b"), Move("a", "c")))  # fmt: skip
+SLIDE = BlockTask({"a": GROUND}, (Move("a", GROUND, slide=True),))
+
+
+def ways(found: decomposing.Decomposition, owner: str, name: str) -> list[tuple[int, ...]]:
+    return [evidence.subtasks for evidence in found.properties[owner][name].evidence]
+
+
+def test_physics_and_the_papers_table_1_name_what_each_subtask_tells():
+    found = decompose(PAPER)
+    signals = {i: {entry.name: evidence.signals(i) for entry, evidence in found.reveals(i)
+                   if found.in_paper(i, entry)} for i in range(4)}  # fmt: skip
+    forces = ("horizontal forces", "vertical forces")
+    on_ground = {"height": ("vertical positions",), "friction": forces}
+    above = {"weight": ("vertical forces",), "width": ("horizontal positions",), "friction": forces}
+    assert signals == {0: {}, 1: on_ground, 2: above, 3: on_ground}
+    assert ways(found, "block2", "height") == [(1, 3)]
+    assert ways(found, "block1", "width") == [(1,), (2,), (3,)] and ways(found, "block1", "weight") == [(2,)]
+    assert ways(found, "block1", "friction") == [(1,), (2,), (3,)]
+    assert {name: entry.kind for name, entry in found.properties["block1"].items()} == {
+        "weight": "value", "width": "value", "height": "value", "friction": "bound",
+        "friction_on_block2": "bound", "friction_on_ground": "bound"}  # fmt: skip
+
+
+def test_tower_heights_take_several_moves_and_some_are_known_only_together():
+    found = decompose(TOWER)
+    rises = [{"b": -1, "c": -1}, {"c": -1}, {"b": 1}, {"b": 1, "c": 1}]
+    assert height_equations(TOWER) == list(enumerate(rises)) and ways(found, "c", "height") == [(5, 7)]
+    assert ways(found, "b", "height") == [(9, 11)]
+    short = decompose(BlockTask(TOWER.initial, TOWER.moves[:2]))
+    assert ways(short, "b", "height") == [(1, 3, 5, 7)]  # b + c from the first move, c from the second
+    assert short.properties["a"]["height"].evidence == ()
+    found = decompose(BlockTask(TOWER.initial, TOWER.moves[:1]))
+    reasons = {name: entries["height"].reason for name, entries in found.properties.items()}
+    assert reasons == {"a": "no recorded move changes the height at which something rests by a's height",
+                       "b": "move 1 changes heights by b's only together with the height of c",
+                       "c": "move 1 changes heights by c's only together with the height of b"}  # fmt: skip
+    for name in ("weight", "width", "friction"):
+        assert found.properties["b"][name].reason == "no recorded move grips b"
+
+
+def test_a_slide_tells_friction_and_weight_together_or_friction_of_a_known_weight():
+    found = decompose(SLIDE)
+    assert [s.name for s in found.subtasks] == ["pregrasp", "pickup", "slide", "place", "release"]
+    assert [s.state for s in found.subtasks][1:4] == ["hold-on-ground", "sliding-on-ground", "hold-on-ground"]
+    assert found.subtasks[2].constraints == ("a-ground (slipping)", "finger1-a", "finger2-a")
+    # Coulomb's law at several loads is a line: its slope and intercept tell friction and weight.
+    for name in ("weight", "friction_on_ground"):
+        (evidence,) = found.properties["a"][name].evidence
+        assert (evidence.subtasks, evidence.bound, evidence.condition) == (
+            (2,),
+            False,
+            decomposing.VARYING_LOAD,
+        )
+        assert evidence.signals() == ("horizontal forces", "vertical forces")
+    assert found.properties["a"]["width"].kind == "value"
+    found = decompose(BlockTask({"a": GROUND}, (Move("a", GROUND), Move("a", GROUND, slide=True))))
+    slid = [e for e in found.properties["a"]["friction_on_ground"].evidence if not e.bound]
+    assert [(e.subtasks, e.given, e.condition) for e in slid] == [((6,), (("weight", "a"),), None)]
+    assert ways(found, "a", "weight") == [(2,)]
+
+
+def test_repeats_of_moves_and_unknowns_that_are_known():
+    moves = (Move("a", "b"), Move("a", GROUND))
+    twice = decompose(BlockTask({"a": GROUND, "b": GROUND}, moves, repeat=2))
+    assert [s.move for s in twice.subtasks] == [0] + [m for m in range(4) for _ in range(4)]
+    assert ways(twice, "a", "weight") == [(2,), (6,), (10,), (14,)]
+    assert ways(twice, "b", "height") == [(1, 3), (5, 7), (9, 11), (13, 15)]
+    unknown = decompose(BlockTask({"a": GROUND, "b": GROUND}, moves, repeat="unknown"))
+    assert len(unknown.subtasks) == 9
+    assert unknown.notes == ("the moves repeat as often as the recording shows; one round is decomposed",)
+    both = {("weight", "a"): Fraction(1), ("load",): Fraction(-1), Source(0, "f"): Fraction(-1)}
+    assert determined([both]) == {} and set(determined([both], known=[("weight", "a")])) == {("load",)}
+
+
+@st.composite
+def block_tasks(draw):
+    """Plain arguments of tasks, as the type checker draws random numbers, which hypothesis forbids."""
+    names = ["a", "b", "c", "d"][: draw(st.integers(1, 4))]
+    support: dict[str, str] = {}
+    for name in names:
+        free = [GROUND] + [other for other in support if other not in support.values()]
+        support[name] = draw(st.sampled_from(free))
+    initial, moves = dict(support), []
+    for _ in range(draw(st.integers(1, 6))):
+        free = [name for name in names if name not in support.values()]
+        name, slide = draw(st.sampled_from(free)), draw(st.booleans())
+        to = support[name] if slide else draw(st.sampled_from([GROUND, *(f for f in free if f != name)]))
+        moves.append((name, to, slide))
+        support[name] = to
+    return initial, moves
+
+
+@settings(max_examples=60, deadline=None)
+@given(block_tasks())
+def test_heights_agree_with_stacking_and_rank_and_every_property_has_evidence_or_a_reason(arguments):
+    task = BlockTask(arguments[0], tuple(Move(*move) for move in arguments[1]))
+    heights = dict(zip(task.objects, np.sqrt([2.0, 3.0, 5.0, 7.0]), strict=False))
+    support = dict(task.initial)
+
+    def bottom(name: str) -> float:
+        return 0.0 if support[name] == GROUND else bottom(support[name]) + heights[support[name]]
+
+    matrix = np.zeros((len(task.moves), len(task.objects)))
+    for (index, rise), move in zip(height_equations(task), task.moves, strict=True):
+        before = bottom(move.object)
+        support[move.object] = move.to
+        assert sum(heights[name] * c for name, c in rise.items()) == pytest.approx(
+            bottom(move.object) - before
+        )
+        matrix[index, [task.objects.index(name) for name in rise]] = list(rise.values())
+    free = np.abs(null_space(matrix)).max(axis=1, initial=0.0) > 1e-9
+    found = decompose(task)
+    assert [found.properties[name]["height"].kind == "value" for name in task.objects] == list(~free)
+    lifted = {move.object for move in task.moves if not move.slide}
+    touched = {move.object for move in task.moves}
+    for name, entries in found.properties.items():
+        for entry in entries.values():
+            assert (entry.reason is None) == bool(entry.evidence)
+        plain = [e for e in entries["weight"].evidence if e.condition is None]
+        assert bool(plain) == (name in lifted)
+        assert (entries["width"].kind, entries["friction"].kind) == (
+            ("value", "bound") if name in touched else (None, None))  # fmt: skip
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.lists(st.integers(-2, 2), min_size=5, max_size=5), min_size=1, max_size=6))
+def test_elimination_agrees_with_numerical_null_space(rows):
+    equations = [
+        {("weight", str(j)): Fraction(c) for j, c in enumerate(row) if c} | {Source(i, "f"): Fraction(-1)}
+        for i, row in enumerate(rows)
+    ]
+    found = determined(equations)
+    free = np.abs(null_space(np.array(rows, dtype=float))).max(axis=1, initial=0.0) > 1e-9
+    assert {int(name) for _, name in found} == set(np.flatnonzero(~free))
+    for (_, name), row in found.items():  # its sources are the combination that leaves it alone
+        combined = sum(float(c) * np.array(rows[source.subtask]) for source, c in row.items())
+        np.testing.assert_allclose(combined, np.eye(5)[int(name)], atol=1e-12)

@@ -157,8 +157,7 @@ def test_what_cannot_be_watched_is_refused_and_a_smaller_lag_settles_sooner():
     assert settled[0.1] < settled[1.0] <= TRUTH[0] + 1.0 + 0.15
     refused("plain ordered task", Watcher, {"sequence": ["a", "b"]}, RIG)
     refused("lag", Watcher, TASK, RIG, -1.0)
-    with pytest.raises(ValueError, match="expected"):
-        Watcher(TASK, RIG).update(0.0, [1.0])
+    refused("expected", Watcher(TASK, RIG).update, 0.0, [1.0], error=ValueError)
 
 
 def test_a_block_let_go_in_mid_air_and_an_early_end_do_not_fit(watched):

@@ -1,17 +1,29 @@
-"""decompose, segment, identify and demo: the outward contract, end to end."""
+"""decompose, identify, inspect and new, end to end; actual.toml and what contradicts it."""
 
 import json
-import math
+import os
 import re
 import shutil
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
+import file_writers
 import numpy as np
 import pandas as pd
 import pytest
+from fault_scene import CARTESIAN
+from refusals import refused
 
-from estimation.report import property_rows
+from estimation.report import compare, disagreements, parse_actual, property_rows, read_actual
+from experiments.wrist_scene import Setup, performances, wrist_recording
 from hmmseg.example import example_folder
+from hmmseg.hand.inspect import inspect, propose
+from hmmseg.hand.read import read_trial
+from hmmseg.io.rig import parse_rig, read_rig
+from hmmseg.io.table import make_table
+from hmmseg.io.task import read_task
 from hmmseg_cli.main import main
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
@@ -23,11 +35,7 @@ PAPER = (example_folder() / "task.toml").read_text(encoding="utf-8")
 
 def document(*args: str, out: Path) -> dict:
     assert main([*args, "--json", str(out), "--quiet"]) == 0
-
-    def refuse(name: str) -> float:
-        raise AssertionError(f"{name} in JSON")
-
-    return json.loads(out.read_text(), parse_constant=refuse)
+    return json.loads(out.read_text(), parse_constant=pytest.fail)
 
 
 @pytest.fixture(scope="module")
@@ -38,24 +46,6 @@ def identified(tmp_path_factory) -> tuple[dict, Path]:
                      str(folder / "figures"), "--report", str(folder / "page.html"),
                      out=folder / "out.json")  # fmt: skip
     return found, folder
-
-
-def test_segment_finds_every_boundary(tmp_path):
-    trial = NONE / "trial_01.csv"
-    found = document("segment", str(trial), *RIG_AND_TASK, out=tmp_path / "out.json")
-    assert found["format"] == "hmmseg.segment/1"
-    (only,) = found["trials"]
-    assert only["complete"] and "failed" not in only and only["rate"] == pytest.approx(20)
-    segments = only["segments"]
-    truth = json.loads((NONE / "truth" / "trial_01.json").read_text())["boundaries"]
-    assert [s["end"] for s in segments[:-1]] == pytest.approx(truth, abs=0.03)
-    assert [a["end"] for a in segments[:-1]] == [b["start"] for b in segments[1:]]
-    assert segments[0]["start"] == 0.0 and segments[-1]["end"] == pytest.approx(9.95)
-    assert [s["subtask"] for s in segments] == ["pregrasp", "pickup", "carry", "place", "release", "pickup",
-                                                "carry", "place", "release"]  # fmt: skip
-    for segment in segments[1:]:
-        low, high = segment["start_90"]
-        assert low < segment["start"] < high and segment["start_sd"] > 0
 
 
 def test_identify_recovers_the_blocks(identified):
@@ -78,6 +68,11 @@ def test_identify_recovers_the_blocks(identified):
     assert found["sampler"]["ess"] > 500 and found["sampler"]["rhat"] < 1.02
     assert found["reasons"] == {} and found["warnings"] == []
     assert found["actual"]["block1"]["width"]["inside_95"]
+    segments = found["trials"][0]["segments"]
+    assert [a["end"] for a in segments[:-1]] == [b["start"] for b in segments[1:]]
+    for segment in segments[1:]:
+        low, high = segment["start_90"]
+        assert low < segment["start"] < high and segment["start_sd"] > 0
 
 
 def test_identify_draws_figures_and_one_self_contained_page(identified):
@@ -156,20 +151,6 @@ def test_rigs_without_stiffness_and_the_papers_method_say_what_they_lack(tmp_pat
     assert re.search(r"about \d{4} N/m", warnings) and "inf," not in warnings
 
 
-@pytest.mark.slow  # `make wheel` runs it as well
-def test_demo_runs_on_the_packages_own_recordings(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    found = document("demo", out=tmp_path / "out.json")
-    assert found["format"] == "hmmseg.demo/1"
-    assert {"corner.png", "report.html"} <= {p.name for p in (tmp_path / "demo").iterdir()}
-    for block in found["actual"].values():
-        assert all(abs(entry["relative_deviation"]) < 0.02 for entry in block.values())
-    pads = found["diagnosis"]["effects"]["fingertip_compliance"]["parameters"]
-    for name, true in (("normal_stiffness", 4000.0), ("shear_stiffness", 2500.0)):
-        low, high = pads[name]["interval_90"]
-        assert low < true < high and high - low < 0.15 * true, name  # what their rig.toml states
-
-
 def test_plain_tasks_and_block_tasks_are_kept_apart(tmp_path, capsys):
     task = tmp_path / "task.toml"
     task.write_text('sequence = ["approach", "insertion"]\n')
@@ -181,32 +162,6 @@ def test_plain_tasks_and_block_tasks_are_kept_apart(tmp_path, capsys):
     alone = shutil.copy(trial, tmp_path)  # no rig.toml lies beside it
     assert main(["segment", alone, "--task", str(NONE / "task.toml")]) == 2
     assert "--rig" in capsys.readouterr().err
-
-
-def test_plain_ordered_task_fits_saves_and_segments(tmp_path):
-    rng = np.random.default_rng(0)
-    task, labels, model = tmp_path / "task.toml", tmp_path / "labels", tmp_path / "model.npz"
-    task.write_text('sequence = ["rest", "push", "rest again"]\nchannels = ["f"]\n')
-    labels.mkdir()
-    edges = []
-    for i in range(4):
-        a, b = 2 + rng.uniform(), 5 + rng.uniform()
-        t = np.arange(0, 8, 0.02)
-        force = np.where((t > a) & (t < b), 3.0, 0.0) + 0.1 * rng.normal(size=t.size)
-        pd.DataFrame({"t": t, "f": force}).to_csv(tmp_path / f"push_{i}.csv", index=False)
-        edges.append((a, b))
-        if i < 2:
-            (labels / f"push_{i}.json").write_text(json.dumps({"boundaries": [a, b]}))
-    trials = [str(tmp_path / f"push_{i}.csv") for i in range(4)]
-    fitted = document("fit", *trials[:2], "--task", str(task), "--labels", str(labels), "--model", str(model),
-                      out=tmp_path / "fit.json")  # fmt: skip
-    assert fitted["labelled"] == ["push_0.csv", "push_1.csv"] and model.exists()
-    found = document("segment", *trials[2:], "--task", str(task), "--model", str(model),
-                     "--figures", str(tmp_path / "figures"), out=tmp_path / "segment.json")  # fmt: skip
-    for trial, (a, b) in zip(found["trials"], edges[2:], strict=True):
-        assert [s["end"] for s in trial["segments"][:-1]] == pytest.approx([a, b], abs=0.06)
-        assert trial["segments"][0]["object"] is None and trial["segments"][1]["state"] == "push"
-        assert math.isfinite(trial["log_evidence"])
 
 
 @pytest.fixture
@@ -247,7 +202,11 @@ def test_the_papers_equation_1_and_its_document(decomposed):
     assert document["height_equations"] == [{"move": 1, "rise": {"block2": -1}},
                                             {"move": 2, "rise": {"block1": 1}}]  # fmt: skip
     assert (document["reasons"], document["notes"], document["repeat"]) == ({}, [], 1)
-    pickup = document["subtasks"][1]
+    states, pickup = document["subtasks"], document["subtasks"][1]
+    assert [s["support"] for s in states] == [None, "block2", None, "ground", None, "ground", None, "block1",
+                                              None]  # fmt: skip
+    assert [s["move"] for s in states] == [1] * 5 + [2] * 4
+    assert states[2]["constraints"] == ["finger1-block1", "finger2-block1"] and states[4]["constraints"] == []
     assert {key: pickup[key] for key in ("index", "subtask", "object", "state", "move", "support")} == {
         "index": 1, "subtask": "pickup", "object": "block1", "state": "hold-on-ground", "move": 1,
         "support": "block2"}  # fmt: skip
@@ -267,9 +226,8 @@ def test_names_reasons_and_notes_of_blocks_and_of_a_plain_sequence(decomposed):
         'repeat = "unknown"\n[objects.cup]\non = "ground"\n[objects.lid]\non = "ground"\n'
         '[[moves]]\nobject = "cup"\nto = "ground"\nslide = true\n'
     )
-    assert (
-        "Slide cup = (sliding-on-ground cup, {friction cup, friction on ground cup})" in document["equation"]
-    )
+    slide = "Slide cup = (sliding-on-ground cup, {friction cup, friction on ground cup})"
+    assert slide in document["equation"]
     assert document["properties"]["lid"]["weight"] is None
     assert document["reasons"]["lid.weight"] == "no recorded move grips lid"
     assert document["properties"]["cup"]["friction_on_ground"]["kind"] == "value"
@@ -280,3 +238,335 @@ def test_names_reasons_and_notes_of_blocks_and_of_a_plain_sequence(decomposed):
     assert document["properties"] == {}
     assert document["notes"] == ["a plain ordered task has no block physics: no properties"]
     assert "height_equations" not in document and "approach" in printed
+
+
+GOOD = {"block1": {"weight": {"unit": "N", "value": 0.343, "sd": 0.0005}}}
+FOUND = {"block1": {"weight": {"mean": 0.4639, "sd": 0.0015, "interval_95": [0.461, 0.467]},
+                    "width": {"mean": 0.036105, "sd": 1.6e-5, "interval_95": [0.03607, 0.03614]},
+                    "height": None, "friction": {"lower_bound": 0.5}}}  # fmt: skip
+
+
+def test_a_file_gives_values_with_deviations_and_a_missing_one_is_named(tmp_path):
+    path = tmp_path / "actual.toml"
+    path.write_text(
+        '[block1.weight]\nunit = "N"\nvalue = 0.343\nsd = 0.0005\n'
+        '[block2.height]\nunit = "m"\nvalue = 1\n[block2.friction]\nunit = "1"\nvalue = 1.2\nsd = 0.1\n'
+    )
+    assert read_actual(path, ["block1", "block2"]) == {"block1": {"weight": (0.343, 0.0005)},
+                                                       "block2": {"height": (1.0, 0.0),
+                                                                  "friction": (1.2, 0.1)}}  # fmt: skip
+    refused(r"absent\.toml: no such file", read_actual, tmp_path / "absent.toml", ["block1"])
+
+
+@pytest.mark.parametrize("table, message", [
+    *(({"block1": {"weight": entry}}, message) for entry, message in [
+        ({"unit": "kg", "value": 1.0}, "key block1.weight.unit: found 'kg'; expected \"N\""),
+        ({"value": 1.0}, "key block1.weight.unit: found None"),
+        ({"unit": "N"}, "key block1.weight.value: found None; expected a number > 0"),
+        ({"unit": "N", "value": 0.0}, "key block1.weight.value: found 0.0; expected a number > 0"),
+        ({"unit": "N", "value": True}, "key block1.weight.value: found True"),
+        ({"unit": "N", "value": float("nan")}, "key block1.weight.value: found nan"),
+        ({"unit": "N", "value": 1.0, "sd": -0.1}, "key block1.weight.sd: found -0.1; expected a number >= 0"),
+        ({"unit": "N", "value": 1.0, "sdd": 0.1}, "key block1.weight.sdd: unknown key; expected one of sd, "),
+        (0.3, "key block1.weight: found 0.3; expected a table with unit, value and sd"),
+    ]),
+    ({"blok1": GOOD["block1"]}, "key blok1: is not an object of the task; expected one of block1, block2 "
+                                "(did you mean block1?)"),
+    ({"block1": {"wieght": {}}}, "key block1.wieght: unknown property; expected one of friction, height, "
+                                 "weight, width (did you mean weight?)"),
+    ({"block1": 3}, "key block1: found 3; expected tables [block1.PROPERTY]")])  # fmt: skip
+def test_refused_entries_and_tables(table, message):
+    refused(re.escape(message), parse_actual, table, ["block1", "block2"])
+
+
+def test_what_the_recordings_contradict_is_remarked_on():
+    measured = {"block1": {"weight": (0.5126, 0.0005), "width": (0.0361, 1e-4), "height": (0.026, 1e-4)}}
+    compared = compare(FOUND, measured)
+    assert compared["block1"]["weight"]["disagrees"] and not compared["block1"]["width"]["disagrees"]
+    assert compared["block1"]["height"] == {"value": 0.026, "sd": 1e-4}
+    (line,) = disagreements(FOUND, compared)
+    assert line.startswith("block1.weight: the recordings say 0.4639 ± 0.0015 N, 9.5 % below")
+    assert not compare(FOUND, measured, smallest=0.2)["block1"]["weight"]["disagrees"]  # [tolerance] property
+    compared = compare(FOUND, {"block1": {"friction": (0.3, 0.02)}})
+    assert disagreements(FOUND, compared)[0].startswith("block1.friction: measured as 0.300 ± 0.020, but")
+    assert disagreements(FOUND, compare(FOUND, {"block1": {"friction": (0.45, 0.02)}})) == []
+
+
+T = np.arange(0, 2, 0.02)
+WRIST = {"t": T, "width": 0.06 - 0.03 * (T > 1), "ee_y": 0.1 * T, "ee_z": 0.2 - 0.05 * T,
+         **{f"{letter}{axis}": np.sin(T) for letter in "FT" for axis in "xyz"}}  # fmt: skip
+OTHERS = {"t": ("stamp", 1e9), "x1": ("finger_left_x_mm", 1e3), "y1": ("finger_left_z_mm", 1e3),
+          "vx1": ("finger_left_vx", 1.0), "vy1": ("finger_left_vz", 1.0), "fx1": ("LeftForceX [mN]", 1e3),
+          "fy1": ("LeftForceZ [mN]", 1e3), "x2": ("finger_right_x", 1e3), "y2": ("finger_right_z", 1e3),
+          "vx2": ("finger_right_vx", 1.0), "vy2": ("finger_right_vz", 1.0), "fx2": ("RightForceX [mN]", -1e3),
+          "fy2": ("RightForceZ [mN]", -1e3)}  # fmt: skip
+FINGERS = {name: CARTESIAN[name] for name in ("t", "x1", "y1", "fx1", "fy1", "x2", "y2", "fx2", "fy2")}
+HZ = 20
+SIDES = {"1": "links", "2": "rechts"}
+FINGER_NAMES = {name: (f"Finger_{SIDES[name[1]]}_{name[0]}_mm", 1e3) if len(name) == 2
+                else (f"Kraft_{SIDES[name[2]]}_{name[1]}_N", 1.0) for name in FINGERS
+                if name != "t"}  # fmt: skip
+WRIST_NAMES = {"width": ("Oeffnung_mm", 1e3), "ee_y": ("TCP_y_mm", 1e3), "ee_z": ("TCP_z_mm", 1e3),
+               **{f"F{axis}": (f"F{axis}_N", 1.0) for axis in "xyz"}}  # fmt: skip
+FINGER_FILES = {
+    "MCAP": lambda f: file_writers.mcap_of(f / "a.mcap", file_writers.finger_topics(FINGERS)),
+    "ROS 1 bag": lambda f: file_writers.bag_of(f / "a.bag", file_writers.finger_topics(FINGERS)),
+    "ROS 2 bag": lambda f: file_writers.bag_of(f / "a", file_writers.finger_topics(FINGERS)),
+    "LeRobot v2": lambda f: lerobot(f / "a", 2, HZ, file_writers.finger_columns(FINGERS)),
+    "LeRobot v3": lambda f: lerobot(f / "a", 3, HZ, file_writers.finger_columns(FINGERS)),
+    "robomimic": lambda f: (
+        f"{file_writers.robomimic_of(f / 'a.hdf5', HZ, [file_writers.finger_vectors(FINGERS)] * 2)}#demo_1"
+    ),
+    "CSV of a spreadsheet": lambda f: written(f / "a.csv", file_writers.german(FINGERS, FINGER_NAMES)),
+}
+WRIST_FILES = {
+    "MCAP": lambda f, c: file_writers.mcap_of(f / "a.mcap", file_writers.wrist_topics(c)),
+    "ROS 1 bag": lambda f, c: file_writers.bag_of(f / "a.bag", file_writers.wrist_topics(c)),
+    "ROS 2 bag": lambda f, c: file_writers.bag_of(f / "a", file_writers.wrist_topics(c)),
+    "LeRobot v3": lambda f, c: lerobot(f / "a", 3, 50, {k: v for k, v in c.items() if k != "t"}),
+    "CSV of a spreadsheet": lambda f, c: written(f / "a.csv", file_writers.german(c, WRIST_NAMES)),
+    "robomimic": lambda f, c: (
+        f"{file_writers.robomimic_of(f / 'a.hdf5', 50, [file_writers.wrist_vectors(c)])}#demo_0"
+    ),
+}
+
+
+def test_times_and_rates_that_contradict_are_told(tmp_path, capsys):
+    frame = pd.DataFrame(CARTESIAN)
+    pd.concat([frame, frame]).to_csv(tmp_path / "two.csv", index=False)
+    assert main(["inspect", str(tmp_path / "two.csv")]) == 0
+    said = capsys.readouterr()
+    assert "column t: 0 after" in said.err and "the times are not" in said.out and "next:" not in said.out
+    rig = read_rig(NONE / "rig.toml").model_copy(update={"rate": 50.0})
+    trial = read_trial(NONE / "trial_01.csv", rig)
+    assert any("is sampled at 20 Hz, but rate = 50 in rig.toml" in each for each in trial.warnings)
+
+
+def test_another_labs_file_is_read_with_what_inspect_proposes(tmp_path, capsys):
+    ours = dict(CARTESIAN)
+    frame = pd.DataFrame({name: ours[channel] * factor for channel, (name, factor) in OTHERS.items()})
+    frame["stamp"] = frame["stamp"].round().astype(np.int64)
+    frame.to_csv(tmp_path / "a.csv", index=False, sep=";", decimal=",")
+    (tmp_path / "rig.toml").write_text("gravity = 9.81\n")
+    assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--json",
+                 "-"]) == 0  # fmt: skip
+    document = json.loads(capsys.readouterr().out)
+    (file,) = document["files"]
+    assert file["mapping"]["t"] == {"from": "stamp", "unit": "ns"}
+    assert file["mapping"]["x1"] == {"from": "finger_left_x_mm", "unit": "mm"}
+    assert file["mapping"]["x2"] == {"from": "finger_right_x", "unit": "mm"}  # by how far it travels
+    assert file["mapping"]["fx2"] == {"from": "RightForceX [mN]", "unit": "mN", "sign": -1}
+    assert any("push the same way" in line for line in file["findings"])
+    assert any("fy2 pulls down" in line for line in file["findings"])  # told, and left to a person
+    rig = read_rig(tmp_path / "rig.toml")
+    assert rig.gravity == 9.81
+    rig = rig.model_copy(update={"columns": {
+        **rig.columns, "fy2": rig.columns["fy2"].model_copy(update={"sign": -1.0})}})  # fmt: skip
+    trial = read_trial(tmp_path / "a.csv", rig)
+    for name, values in trial.channels.items():
+        np.testing.assert_allclose(values, ours[name], atol=1e-9, err_msg=name)
+
+
+def test_what_is_in_a_file_a_log_and_a_file_of_several(tmp_path, capsys):
+    t = np.delete(np.arange(100) * 0.02, [40, 41, 42, 43, 44])
+    force = np.sin(t)
+    force[3] = np.nan
+    table = pd.DataFrame({"t": t, "force [N]": force, "note": "x", "left": np.nan})
+    table.to_csv(tmp_path / "a.csv", index=False)
+    found = inspect(tmp_path / "a.csv")
+    assert (found.samples, found.rate, found.end) == (95, pytest.approx(50.0), pytest.approx(1.98))
+    assert found.gaps == ((pytest.approx(0.78), pytest.approx(0.9)),)
+    _, channel, note, left = found.channels
+    assert left.rate is None and left.missing == 95
+    assert (channel.unit, channel.missing, note.text, found.mapping) == ("N", 1, True, {})
+    assert channel.maximum == pytest.approx(np.nanmax(force))
+    log = inspect(file_writers.mcap_of(tmp_path / "a.mcap", file_writers.planted()))
+    rates = {channel.name: channel.rate for channel in log.channels}
+    assert rates["/wrench.wrench.force.x"] == pytest.approx(100.0)
+    assert rates["/pose.pose.position.z"] == pytest.approx(20.0)
+    path = file_writers.write_robomimic(tmp_path / "demos.hdf5")
+    assert main(["inspect", str(path)]) == 0
+    assert "the first of 2 recordings (demo_0 ... demo_1)" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("case", ["none_1", "paper_blocks"])
+def test_nothing_is_proposed_where_nothing_is_needed(case):
+    found = inspect(NONE.parent / case / "trial_01.csv")
+    assert (found.mapping, found.remarks) == ({}, ())
+
+
+@pytest.mark.parametrize(("names", "expected"), [
+    (["time", "L_pos_x", "L_pos_y", "L_fx", "L_fy", "R_pos_x", "R_pos_y", "R_fx", "R_fy"],
+     {"t": "time", "x1": "L_pos_x", "y1": "L_pos_y", "fx1": "L_fx", "fy1": "L_fy", "x2": "R_pos_x",
+      "y2": "R_pos_y", "fx2": "R_fx", "fy2": "R_fy"}),
+    (["timestamp", "finger1.tip.x", "finger1.tip.z", "finger1.force.x", "finger1.force.z",
+      "finger2.tip.x", "finger2.tip.z", "finger2.force.x", "finger2.force.z", "finger1.torque.x"],
+     {"t": "timestamp", "x1": "finger1.tip.x", "y1": "finger1.tip.z", "fx1": "finger1.force.x",
+      "fy1": "finger1.force.z", "x2": "finger2.tip.x", "y2": "finger2.tip.z", "fx2": "finger2.force.x",
+      "fy2": "finger2.force.z"}),
+    (["t", "right_joint_1", "right_joint_2", "left_joint_1", "left_joint_2", "F1x", "F1y", "F2x", "F2y"],
+     {"q21": "right_joint_1", "q22": "right_joint_2", "q11": "left_joint_1", "q12": "left_joint_2",
+      "fx1": "F1x", "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
+    (["t", "joint1_1", "joint1_2", "joint2_1", "joint2_2", "F1x", "F1y", "F2x", "F2y"],
+     {"q11": "joint1_1", "q12": "joint1_2", "q21": "joint2_1", "q22": "joint2_2", "fx1": "F1x",
+      "fy1": "F1y", "fx2": "F2x", "fy2": "F2y"}),
+    (["t", "temperature", "pressure"], {})])  # fmt: skip
+def test_names_taken_apart(names, expected):
+    table = make_table("a", {name: np.zeros(9) for name in names})
+    assert {ours: fields["from"] for ours, fields in propose(table).items()} == expected
+
+
+def test_what_to_do_next_is_said_and_no_line_to_copy_is_wrapped(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    assert main(["inspect", str(NONE / "trial_01.csv")]) == 0
+    assert "all columns understood; next: hmmseg segment" in capsys.readouterr().out
+    ours = dict(CARTESIAN)
+    frame = pd.DataFrame({OTHERS[name][0]: values for name, values in ours.items()})
+    frame.to_csv(tmp_path / "a.csv", index=False)
+    assert main(["inspect", str(tmp_path / "a.csv")]) == 0
+    text = capsys.readouterr().out
+    (start,) = [i for i, line in enumerate(text.split("\n")) if line == "[columns]"]
+    toml = "\n".join(text.split("\n")[start:]).split("\n\n")[0]
+    assert tomllib.loads(toml)["columns"]["t"]["from"] == "stamp"
+    assert f"next: hmmseg inspect {tmp_path / 'a.csv'} --write rig.toml" in text
+
+
+@pytest.mark.parametrize("text", ["", "t,x\n", "# nothing\n"])
+def test_an_empty_file_is_refused(tmp_path, capsys, text):
+    (tmp_path / "a.csv").write_text(text)
+    assert main(["inspect", str(tmp_path / "a.csv")]) == 2
+    line = f"{tmp_path}/a.csv: is empty; expected a header row and a row for every sample\n"
+    assert capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize(("rig", "line"), [
+    ("[columns]\nx1 = 'a'\n", "--write .*rig.toml: already has .columns.; expected a rig without it"),
+    ("rate = -1", "rig.toml: key rate: "),
+    ("rate = ", "rig.toml: not valid TOML")])  # fmt: skip
+def test_a_rig_that_cannot_take_the_mapping_stays_as_it_was(tmp_path, capsys, rig, line):
+    ours = dict(CARTESIAN)
+    pd.DataFrame({"time": ours.pop("t"), **ours}).to_csv(tmp_path / "a.csv", index=False)
+    (tmp_path / "rig.toml").write_text(rig)
+    assert main(["inspect", str(tmp_path / "a.csv"), "--write", str(tmp_path / "rig.toml"), "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and re.search(line, error) and (tmp_path / "rig.toml").read_text() == rig
+
+
+@pytest.mark.parametrize("hand", ["cartesian", "jointed", "gripper", "none"])
+def test_new_lays_out_files_that_read(tmp_path, hand):
+    assert main(["new", str(tmp_path / "lab"), "--hand", hand, "--quiet"]) == 0
+    rig, task = read_rig(tmp_path / "lab/rig.toml"), read_task(tmp_path / "lab/task.toml")
+    assert (rig.jointed, rig.gripper is not None) == (hand == "jointed", hand == "gripper")
+    assert hasattr(task, "sequence") == (hand == "none")
+
+
+def test_a_gripper_laid_out_takes_the_names_of_a_log(tmp_path, capsys):
+    """`new`, then `inspect --write`: the file's names in the places of those laid out, all else as it was."""
+    rig = tmp_path / "lab/rig.toml"
+    log = file_writers.mcap_of(tmp_path / "a.mcap", file_writers.wrist_topics(WRIST))
+    assert main(["new", str(rig.parent), "--hand", "gripper", "--quiet"]) == 0
+    before = rig.read_text()
+    assert main(["inspect", str(log), "--write", str(rig), "--quiet"]) == 0
+    gripper = read_rig(rig).gripper
+    assert gripper.position["z"] == "/franka/ee_pose.pose.position.z"
+    assert gripper.opening[1] == "/franka_gripper/joint_states.position.panda_finger_joint2"
+    assert gripper.wrench[5] == "/ft_sensor/wrench.wrench.torque.z"
+    kept = [line for line in rig.read_text().split("\n") if "/" not in line.split(" = ")[-1]]
+    assert set(kept) <= {*before.split("\n"), 'closing = "y"  # the axis along which the pads close'}
+    assert main(["inspect", str(log), "--write", str(rig), "--quiet"]) == 2  # they are somebody's now
+    assert "already has [gripper]; expected a rig without it" in capsys.readouterr().err
+
+
+def test_new_fills_in_a_rig_never_hangs_and_never_writes_over(tmp_path, capsys):
+    command = [Path(sys.executable).with_name("hmmseg"), "new", "lab"]
+    for stdin in (subprocess.DEVNULL, subprocess.PIPE):
+        done = subprocess.run(command, cwd=tmp_path, stdin=stdin, capture_output=True, timeout=60,
+                              check=False)  # fmt: skip
+        text = done.stderr.decode()
+        if stdin == subprocess.DEVNULL:
+            assert (done.returncode, sorted(os.listdir(tmp_path / "lab"))) == (0, ["rig.toml", "task.toml"])
+    assert done.returncode == 2
+    assert text == "lab/rig.toml: is there already and would be written over; expected another folder\n"
+    table = pd.read_csv(NONE / "trial_01.csv")
+    table.to_csv(tmp_path / "jointed.csv", index=False)
+    assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 0
+    text = (tmp_path / "one/rig.toml").read_text()
+    assert "rate = 20.0" in text and "[fingers.1]" in text and "hmmseg segment" in capsys.readouterr().out
+    assert main(["new", str(tmp_path / "one"), "--from", str(tmp_path / "jointed.csv")]) == 2
+
+
+def test_new_lays_out_the_map_of_a_robot(tmp_path, capsys):
+    from simgap.simulators.mjcf.map import Map
+
+    (tmp_path / "robot.xml").write_text(
+        '<mujoco><worldbody><body><joint name="elbow" axis="0 1 0"/><geom size=".1"/></body></worldbody>'
+        '<actuator><motor name="m1" joint="elbow"/></actuator></mujoco>'
+    )
+    (tmp_path / "log.csv").write_text(
+        "ros_stamp,elbow_deg,elbow_vel,elbow_cmd,tau_elbow,room\n"
+        + "".join(f"{1700000000000000000 + k * 10000000},1,2,3,5,4\n" for k in range(20))
+    )
+    given = ["--mjcf", str(tmp_path / "robot.xml"), "--from", str(tmp_path / "log.csv")]
+    assert main(["new", str(tmp_path), *given]) == 0
+    assert "columns left to you: room" in " ".join(capsys.readouterr().out.split())
+    found = Map.from_toml(tmp_path / "map.toml")
+    assert {n: (m.thing, m.kind) for n, m in found.columns.items()} == {
+        "elbow_deg": ("joint", "position"), "elbow_vel": ("joint", "velocity"),
+        "elbow_cmd": ("actuator", "command"), "tau_elbow": ("actuator", "force")}  # fmt: skip
+    assert (found.clock.column, found.clock.size) == ("ros_stamp", 1e-9)
+    assert main(["new", str(tmp_path / "other"), "--model", str(tmp_path / "robot.xml")]) == 2
+
+
+def lerobot(folder, version, rate, columns):
+    states = np.stack(list(columns.values()), axis=1)
+    file_writers.lerobot_of(folder, version, rate, list(columns), [states, states],
+                            [np.zeros((len(states), 2))] * 2)  # fmt: skip
+    return f"{folder}#1"
+
+
+def written(path, data):
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("kind", FINGER_FILES)
+def test_two_fingers_read_as_recorded(tmp_path, kind):
+    file, rig = FINGER_FILES[kind](tmp_path), tmp_path / "rig.toml"
+    assert main(["inspect", str(file), "--write", str(rig), "--quiet"]) == 0
+    trial = read_trial(file, read_rig(rig))
+    assert trial.warnings == ()
+    at = np.searchsorted(trial.t, FINGERS["t"] - FINGERS["t"][0] - 1e-4)  # poses are logged twice as often
+    close = 1e-6 if "LeRobot" in kind else 2e-9  # single precision
+    np.testing.assert_allclose(trial.t[at], FINGERS["t"] - FINGERS["t"][0], atol=1e-6)
+    for name in FINGERS.keys() - {"t"}:
+        np.testing.assert_allclose(trial.channels[name][at], FINGERS[name], atol=close, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def wrist():
+    setup = Setup(axes=("x", "y", "z"))
+    columns = wrist_recording(performances(1)[0], setup)
+    names = {"gap": "width", "py": "ee_y", "pz": "ee_z", "Fx": "Fx", "Fy": "Fy", "Fz": "Fz"}
+    out = {"t": columns["t"]} | {theirs: columns[ours] for ours, theirs in names.items()}
+    return out | {f"T{axis}": 0 * columns["t"] for axis in "xyz"}
+
+
+@pytest.mark.parametrize("kind", WRIST_FILES)
+def test_a_wrist_reads_as_recorded(tmp_path, wrist, kind, capsys):
+    plain = parse_rig({"gripper": {"position": {"y": "ee_y", "z": "ee_z"}, "opening": "width",
+                                   "wrench": ["Fx", "Fy", "Fz"]}})  # fmt: skip
+    expected = read_trial(wrist, plain)
+    file, rig = WRIST_FILES[kind](tmp_path, wrist), tmp_path / "rig.toml"
+    assert main(["inspect", str(file), "--write", str(rig), "--quiet"]) == 0
+    if kind == "robomimic":  # its second finger counts the other way, and the line says so
+        task = written(tmp_path / "task.toml",
+                       b'[objects.a]\non = "ground"\n[[moves]]\nobject = "a"\nto = "ground"\n')  # fmt: skip
+        assert main(["segment", str(file), "--task", str(task), "--rig", str(rig)]) == 2
+        line = capsys.readouterr().err
+        entry = line.split("expected ")[1].split(" under [columns]")[0]
+        rig.write_text(f"{rig.read_text()}\n[columns]\n{entry}\n")
+    trial = read_trial(file, read_rig(rig))
+    assert trial.warnings == ()
+    for name in ("x1", "y1", "fy1", "x2", "y2", "fy2"):
+        np.testing.assert_allclose(trial.channels[name], expected.channels[name],
+                                   atol=1e-3 * (name[0] == "f") + 2e-5)  # fmt: skip

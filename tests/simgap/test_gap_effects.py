@@ -1,15 +1,32 @@
-"""Effects: gradients, neutrality, composition, and that a planted effect is taken out again."""
+"""Effects: gradients, neutrality, planted ones taken out again; one is a file, named nowhere else."""
+
+import ast
+import re
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from jax.tree_util import tree_leaves
+from simgap_swing import Swing, log
 
+import simgap
+from experiments.generic_ensembles import TASK, ensemble
 from hmmseg.hand.kinematics import inverse
 from hmmseg.io.rig import Finger, Fingertip, Rig
+from hmmseg.io.trial import Trial
+from simgap import channels, effects
 from simgap.effects import catalogue
 from simgap.effects.base import Performance, World, flat, tips, turning_compliance
 from simgap.gap.problem import STEP
 from simgap.gap.residuals import contact
+from simgap.generic import effects as of_ensembles
+from simgap.generic.diagnose import diagnose
+from simgap.generic.trials import align
+from simgap.play.world import felt_effects
+from simgap.robot_effects import candidates
+from simgap.robot_effects.base import Setting
+from simgap.simulators.user import checked
 
 CONTRACT = """
 force_bias force_drift force_gain force_crosstalk sensor_rotation force_lag force_lowpass
@@ -20,12 +37,16 @@ viscous_drag structural_vibration contact_impact hand_roll actual
 RIG = Rig(fingers={"1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
                    "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12))},
           fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))  # fmt: skip
+RNG = np.random.default_rng(0)
 DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
 PLANTED = {"force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
            "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
            "force_gain": {"gain": 0.08}, "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
            "sensor_rotation": {"angle1": 0.05, "angle2": -0.04}, "viscous_drag": {"coefficient": 0.7},
            "fingertip_mass": {"mass": 0.012}, "contact_impact": {"impulse": 0.02}}  # fmt: skip
+
+KINEMATIC = {"joint_offset": {"q11": 0.01, "q12": -0.005, "q21": 0.0, "q22": 0.02},
+             "link_length": {"scale": 0.02}}  # fmt: skip
 
 
 def performance(n: int = 400) -> Performance:
@@ -76,12 +97,17 @@ def test_an_effect_that_is_off_changes_nothing_and_is_finite_where_a_fit_begins(
                    for z in tree_leaves(effect.correct(world, v, 1.0)))  # fmt: skip
 
 
-@pytest.mark.parametrize("name", sorted(PLANTED))
+@pytest.mark.parametrize("name", [*PLANTED, *KINEMATIC])
 def test_what_apply_puts_in_correct_takes_out(name):
-    truth, values = performance(), PLANTED[name]
+    truth, values = performance(), (PLANTED | KINEMATIC)[name]
     effect = catalogue()[name]
     recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))
     out = effect.correct(recorded, values, 1.0)
+    if name in KINEMATIC:
+        place = truth.position[::10].reshape(-1, 4)
+        np.testing.assert_allclose(tips(out)[0][0], place, atol=1e-9)
+        assert np.abs(tips(recorded)[0][0] - place).max() > 1e-4
+        return
     before = np.abs(recorded.force - world_of(truth).force).max()
     assert before > 0.01
     tolerance = 0.15 * before if name == "fingertip_mass" else 0.05 * before  # accelerations are differences
@@ -106,18 +132,6 @@ def test_a_mass_off_the_middle_turns_the_block_until_moments_balance():
     np.testing.assert_allclose(turn[up], expected[up], rtol=1e-9)
 
 
-@pytest.mark.parametrize(("name", "values"), [
-    ("joint_offset", {"q11": 0.01, "q12": -0.005, "q21": 0.0, "q22": 0.02}),
-    ("link_length", {"scale": 0.02})])  # fmt: skip
-def test_kinematic_effects_are_undone_in_tip_positions(name, values):
-    truth, effect = performance(), catalogue()[name]
-    recorded = world_of(effect.apply(truth, values, np.random.default_rng(0)))
-    out = effect.correct(recorded, values, 1.0)
-    position, _ = tips(out)
-    np.testing.assert_allclose(position[0], truth.position[::10].reshape(-1, 4), atol=1e-9)
-    assert np.abs(np.asarray(tips(recorded)[0])[0] - truth.position[::10].reshape(-1, 4)).max() > 1e-4
-
-
 def test_what_crosstalk_makes_of_noise_is_known():
     # Or a turn beside a crosstalk, which is a turn and a gain, would win by making all noise smaller.
     rng = np.random.default_rng(0)
@@ -132,7 +146,7 @@ def test_what_crosstalk_makes_of_noise_is_known():
 
 def test_what_is_nearest_to_the_recorded_number_is_put_in_last_and_taken_out_first():
     truth, drag, lag = performance(), catalogue()["viscous_drag"], catalogue()["force_lag"]
-    late = lag.apply(drag.apply(truth, {"coefficient": 5.0}, None), {"delay": 0.1}, None)
+    late = lag.apply(drag.apply(truth, {"coefficient": 5.0}, RNG), {"delay": 0.1}, RNG)
     world = world_of(late)
     for effect, values in ((lag, {"delay": 0.1}), (drag, {"coefficient": 5.0})):
         world = effect.correct(world, values, 1.0)
@@ -142,7 +156,7 @@ def test_what_is_nearest_to_the_recorded_number_is_put_in_last_and_taken_out_fir
     truth = performance()
     gain, bias = catalogue()["force_gain"], catalogue()["force_bias"]
     values = dict.fromkeys(("fx1", "fy1", "fx2", "fy2"), 0.1)
-    recorded = bias.apply(gain.apply(truth, {"gain": 0.5}, None), values, None)
+    recorded = bias.apply(gain.apply(truth, {"gain": 0.5}, RNG), values, RNG)
     np.testing.assert_allclose(flat(recorded), 1.5 * flat(truth) + 0.1)
     assert bias.stage < gain.stage  # what is nearest to the recorded number is taken out first
     world = world_of(recorded)
@@ -158,3 +172,70 @@ def test_pads_that_carry_a_block_hold_it_and_quantised_forces_lie_on_the_lattice
     assert carried.sum() > 3 and (np.asarray(low.slip) * carried).sum() <= 0.2 * carried.sum()
     force = catalogue()["quantisation"].finish(np.array([0.013, -0.049, 1.234]), {"step": 0.02})
     np.testing.assert_allclose(force, [0.02, -0.04, 1.24])
+
+
+PAGE = Path(simgap.__file__).parents[1] / "docs" / "your_effect.md"
+ROOT = Path(simgap.__file__).parent
+# The comparison with given trials and robots have effects of their own, some of the same names.
+CATALOGUES = {ROOT / "generic/effects.py", ROOT / "channels/drives.py"}
+
+
+@pytest.fixture
+def step(tmp_path, monkeypatch):
+    (tmp_path / "step.py").write_text(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0])
+    caches = (channels.channel_effects, effects.catalogue, of_ensembles.effects)
+    monkeypatch.setattr(channels, "__path__", [*channels.__path__, str(tmp_path)])
+    for cache in caches:
+        cache.cache_clear()
+    yield channels.channel_effects()["step"]
+    sys.modules.pop("simgap.channels.step", None)
+    for cache in caches:
+        cache.cache_clear()
+
+
+def test_it_is_a_candidate_everywhere_and_taken_out_of_forces_as_it_was_put_in(step):
+    mine = effects.catalogue()["force_step"]
+    assert list(mine.parameters) == ["fx1", "fy1", "fx2", "fy2"] and "force_step" in felt_effects()
+    assert mine.parameters["fx1"].unit == "N" and mine.parameters["fx1"].sd == pytest.approx(0.09)
+    logs = [log(0), log(1)]
+    robots = candidates(Setting(checked(Swing(), "Swing"), logs))["readout:angle.step"]
+    sd = np.concatenate([r["angle"] for r in logs]).std()
+    assert robots.parameters["step"].sd == pytest.approx(0.03 * sd)
+    mine, t = effects.catalogue()["force_step"], np.linspace(0, 4, 60)
+    truth = np.random.default_rng(0).standard_normal((60, 4))
+    values = {"fx1": 0.1, "fy1": -0.2, "fx2": 0.0, "fy2": 0.3}
+    made = performance()._replace(t=t, force=truth.reshape(-1, 2, 2))
+    put = mine.apply(made, values, RNG).force.reshape(-1, 4)
+    np.testing.assert_allclose(put - truth, np.outer(t > 2, list(values.values())), atol=1e-12)
+    out = mine.correct(world_of(performance())._replace(t=t[None], force=put[None]), values, 1.0)
+    np.testing.assert_allclose(out.force[0], truth, atol=1e-12)
+
+
+def test_it_is_named_in_given_trials(step):
+    rng = np.random.default_rng(3)
+    real, first = ensemble(rng, 6)
+    sim, second = ensemble(rng, 6, name="sim")
+    changed = [Trial(t.file, t.t, t.channels | {"fa": step.read(t.t, t.channels["fa"], {"step": 1.0})})
+               for t in real]  # fmt: skip
+    body = diagnose(align(changed, sim, TASK, boundaries=first | second)).body
+    assert body["causes"] == ["force_step"]
+    assert body["effects"]["force_step"]["parameters"]["fa"]["mean"] == pytest.approx(1.0, rel=0.1)
+
+
+def named_in(path: Path, names: set[str]) -> set[str]:
+    """Effects whose names stand as strings in the code of a file, alone or before what follows a dot."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    texts = (n.value for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str))
+    found = [text for text in texts if not text.endswith(".toml")]  # actual.toml is a file
+    return {text.split(".")[0].split("/")[0] for text in found} & names
+
+
+def test_no_file_but_those_that_define_effects_names_one():
+    names, listed = set(catalogue()), {}
+    for path in sorted(ROOT.rglob("*.py")):
+        # What an effect is taken for, and its own keys, are said where it is defined.
+        own = path.parent == ROOT / "effects" and " = HandEffect(\n" in path.read_text(encoding="utf-8")
+        others = set() if own or path in CATALOGUES else named_in(path, names)
+        if others:
+            listed[str(path.relative_to(ROOT))] = others
+    assert listed == {}

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refused
 
 from experiments.generic_ensembles import PLANTED, TASK, Scatter, ensemble
 from experiments.generic_ensembles import made as case_of
@@ -94,9 +95,7 @@ def test_lags_and_filters_reach_the_spectrum_but_not_the_noise_that_comes_after_
     fast = slice(int((alike.kind[alike.channel == 0] == SLOW).sum()), None)
     plain = predicted(given, 0, {})[fast]
     assert (predicted(given, 0, {"force_lowpass": {"time_constant": 0.1}})[fast] - plain).min() < -2
-    loud = predicted(given, 0, {"noise_level": {"sd": 0.2}})[fast].reshape(3, 8)[
-        :, 4:
-    ]  # above what contacts hold
+    loud = predicted(given, 0, {"noise_level": {"sd": 0.2}})[fast].reshape(3, 8)[:, 4:]  # above contacts'
     np.testing.assert_allclose(loud, np.log(0.04 + 0.0004), atol=0.1)
     assert np.abs(predicted(given, 0, {"force_lag": {"delay": 0.08}})[fast] - plain).max() > 0.2
     plain = predicted(given, 0, {})[fast].reshape(3, 8)[:, -1]  # nothing but noise in the highest band
@@ -128,8 +127,8 @@ def test_effects_can_be_forced_and_alike_ensembles_are_called_alike():
     real, sim, boundaries = made(2, count=4)
     found = diagnose(align(real, sim, TASK, boundaries=boundaries), forced=["force_bias"])
     assert found.body["causes"] == ["force_bias"]
-    with pytest.raises(InputError, match="needs the virtual model or is unknown"):
-        diagnose(align(real, sim, TASK, boundaries=boundaries), forced=["grip_slip"])
+    refused("needs the virtual model or is unknown", diagnose, align(real, sim, TASK, boundaries=boundaries),
+            forced=["grip_slip"])  # fmt: skip
 
 
 @pytest.mark.parametrize("name", list(PLANTED))
@@ -164,12 +163,10 @@ def test_one_trial_is_weaker_and_trials_that_do_not_go_together_are_refused():
     found = diagnose(align(real[:1], sim, TASK, boundaries=boundaries))
     assert any("nothing is held out" in w for w in found.warnings) and "force_bias" in found.leading
     real, sim, boundaries = made(4)
-    with pytest.raises(InputError, match="one real and one simulated"):
-        align(real[:1], sim[:1], TASK, boundaries=boundaries)
-    with pytest.raises(InputError, match="2 increasing times"):
-        align(real, sim, TASK, boundaries=boundaries | {real[0].file: np.array([1.0])})
-    with pytest.raises(InputError, match=r"sim_00.csv: column fc: missing|column fc: missing"):
-        align(real, sim, SequenceTask(TASK.sequence, ("fa", "fc")))
+    refused("one real and one simulated", align, real[:1], sim[:1], TASK, boundaries=boundaries)
+    one = boundaries | {real[0].file: np.array([1.0])}
+    refused("2 increasing times", align, real, sim, TASK, boundaries=one)
+    refused("column fc: missing", align, real, sim, SequenceTask(TASK.sequence, ("fa", "fc")))
 
 
 def test_missing_samples_are_bridged_and_rates_may_differ(alike):
