@@ -100,6 +100,16 @@ def test_recorded_lag_is_found_and_said_and_healthy_forces_are_on_time():
     assert found.remarks == () and np.median(np.abs(residual)) < 0.004
 
 
+def test_pads_under_filtered_forces_are_read_off_whole_grips():
+    _, task = scene()
+    filtered = World("", effects={"force_lowpass": {"time_constant": 0.03}})
+    for judged in trials_of(filtered, [78206, 78207]):
+        (found,) = segment([judged.trial], task, judged.rig)
+        ends = np.array([s.start for s in found.spans[1:]])
+        # Stretches of forces that are late made the pads twice as soft, and releases 30 ms late.
+        assert np.abs(ends - judged.boundaries).max() < 0.015 and "filtered" in found.remarks[0]
+
+
 def test_reading_again_undoes_what_was_found_and_smears_no_jump():
     t = np.arange(0, 1, 0.01)
     ramp, zero = np.clip(t - 0.3, 0, 0.4), np.zeros(t.size)
@@ -165,6 +175,8 @@ def test_a_delay_is_found(delay, step):
 def test_a_filter_is_found_and_told_from_a_delay(constant):
     found = lateness([whole_grip(constant=constant, seed=i) for i in range(4)], PRIOR)
     assert found.late and found.filter and found.delay == pytest.approx(constant, rel=0.2)
+    value, sd = found.compliance
+    assert abs(value - COMPLIANCE) < 3 * sd < 0.3 * COMPLIANCE
 
 
 @pytest.mark.parametrize("prior", [PRIOR, (0.0, 2e-4)])
