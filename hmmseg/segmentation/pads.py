@@ -48,6 +48,7 @@ from hmmseg.segmentation.stretches import (
     ringing,
     steepest,
     stretches,
+    trust,
 )
 
 STEP = 0.0025  # numerics: s; step at which distances and filters are evaluated
@@ -374,14 +375,14 @@ def sense(
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
     timing, toe = lateness(felt, priors[0]), NONE
-    lead = 0.0 if timing.late else timing.delay
+    lead, unknown = 0.0 if timing.late else timing.delay, timing.sd
     if not again:  # corrected forces, or a wrist's, are too coarse for a toe
-        toe = find_toe([(*reading(s, lead), s.sd) for s in grips])
+        toe = find_toe([(*reading(s, lead)[:2], s.sd) for s in grips])
         if toe is not NONE:  # a toe explains an apparent delay
             grips, lead = [replace(s, toe=toe) for s in grips], 0.0
             timing = timing if timing.late else Lateness()
     normal, shear = (
-        _compliance([(*reading(s, lead), s.sd) for s in own], prior, float(r))
+        _compliance([_while_moving(s, lead, unknown) for s in own], prior, float(r))
         for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)
     )
     # Late loads of a stretch are not those of its places.
@@ -390,7 +391,7 @@ def sense(
     doubt = float(np.sqrt(timing.sd**2 + (LATE_SHARE * timing.delay * timing.late) ** 2 + between**2))
     friction = float(np.quantile(ratios, LARGEST)) if ratios else np.inf
     heights = [
-        place + shear.value * load for load, place in (reading(s, lead) for s in loads) if load.size > 3
+        place + shear.value * load for load, place, _ in (reading(s, lead) for s in loads) if load.size > 3
     ]
     rests = np.concatenate([np.zeros(0), *(height - np.median(height) for height in heights)])
     noise = (float(np.median([own.sd for own in loads] or [SLOWEST_SD])),
@@ -415,8 +416,14 @@ def _with_free_motion(
     return ends[0], ends[1]
 
 
+def _while_moving(s: Stretch, lead: float, doubt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Loads, places and their noise (M,): moving, these are off by what is unknown of the delay [s]."""
+    load, place, pace = reading(s, lead)
+    return load, place, np.hypot(s.sd, pace * doubt)
+
+
 def _compliance(
-    readings: Sequence[tuple[np.ndarray, np.ndarray, float]], prior: tuple[float, float],
+    readings: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray | float]], prior: tuple[float, float],
     ringing: float = 0.0,
 ) -> Compliance:  # fmt: skip
     """Common compliance of all stretches, each with its own rest; `prior`: mean and sd [m/N].
@@ -442,7 +449,9 @@ def _compliance(
     return Compliance(value, float(total**-0.5), float(np.sqrt(between)) / max(value, RIGID))
 
 
-def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tuple[float, float, float]:
+def _slope(
+    load: np.ndarray, place: np.ndarray, sd: np.ndarray | float, ringing: float
+) -> tuple[float, float, float]:
     """Compliance [m/N] of one stretch, its information, and its error in common with other stretches.
 
     Loads that ring, by at least `ringing` [N], while nothing moves flatten the line of places over loads, in
@@ -451,9 +460,11 @@ def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tu
     slope, weight = fit_slope(load, place, sd)
     if weight == 0:
         return slope, 0.0, 0.0
-    x, y = load - load.mean(), place.mean() - place
+    own, least = trust(sd, load.size), float(np.min(sd))
+    root = np.sqrt(own)
+    x, y = root * (load - np.average(load, weights=own)), root * (np.average(place, weights=own) - place)
     square, free = float(x @ x), load.size - 2.0
-    middle, apart = slope_between(square, float(x @ y), float(y @ y), free, (ringing, sd))
+    middle, apart = slope_between(square, float(x @ y), float(y @ y), free, (ringing, least))
     if not np.isfinite(apart):
         return middle, 0.0, 0.0
     value = middle if apart else slope
