@@ -265,7 +265,7 @@ def _broken(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray
     switches = np.array([switch_probability(c, change.log_prior, False) for c in contacts])
     likely = np.flatnonzero(switches.max(axis=0) >= LIKELY)
     pairs = zip(contacts, switches, strict=True)
-    masses = [[switched[n] * _density([c], n, change) for n in likely] for c, switched in pairs]
+    masses = [[switched[n] * _density([c], int(n), change) for n in likely] for c, switched in pairs]
     broken = np.cumsum(np.reshape(masses, (len(contacts), -1)), axis=1)
     first = (broken / broken[:, -1:]).max(axis=0)
     return (t[likely, None] + NODES * np.diff(t)[likely, None]).ravel(), np.diff(first, prepend=0.0)
