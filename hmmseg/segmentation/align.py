@@ -19,7 +19,6 @@ from hmmseg.hand.signals import Signals, task_space, timely, with_heights
 from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.levels import decisive
 from hmmseg.segmentation.boundaries import BoundaryPosterior, Kind
 from hmmseg.segmentation.changes import Change, discrepancies
 from hmmseg.segmentation.conformity import Conformity, examine, explain, plan, point_mass, task_boundaries
@@ -91,12 +90,13 @@ def pooled(
     readings, fitted, sensing = once()
     if sensing.late:
         read_anew, fitted_anew, again = once(sensing)
-        if not again.heights_gain(sensing) > decisive(0.5):  # a sensor delays vertical forces as well
+        if again.heights_gain(sensing) < 0:  # a sensor delays vertical forces as well
             sensing = replace(sensing, delay=0.0, delay_sd=LEAD_SD, late=False, filter=False)
         else:
             readings, fitted = read_anew, fitted_anew
             doubt = float(np.hypot(again.delay_sd, sensing.delay_sd))
-            sensing = replace(again, late=True, filter=sensing.filter, delay=sensing.delay, delay_sd=doubt)
+            known = replace(sensing, shear=again.shear, friction=again.friction)
+            sensing = replace(known, rests=again.rests, noise=again.noise, delay_sd=doubt)
     remarks, late = sensing.remarks(rig), sensing.late
     sensing = replace(sensing, delay=0.0) if late else sensing  # re-read forces are on time
     changes = [

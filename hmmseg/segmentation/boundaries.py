@@ -28,8 +28,6 @@ from hmmseg.tables import Brief
 
 POINTS = 41  # numerics: nodes per sample interval
 NODES = (np.arange(POINTS) + 0.5) / POINTS  # numerics: the nodes, as shares of the interval
-BEND = 0.015  # prior: bend that the cubic misses, as a share of interval x change of velocity
-UNSEEN = 0.15  # prior: the same, as a share of the displacement that both velocities do not explain
 LAUNCH = 0.1  # prior: spread of the distance covered after a launch, over gain of speed x time
 MOTION, MOTIONS = (0.05, 1.0), 16  # prior: s; duration of the motion that an impact ends: log-uniform
 STARTS = 48  # numerics: nodes over the time at which that motion started
@@ -73,16 +71,20 @@ class Crossing:
 
 
 def log_smooth(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
-    """Log likelihood of a smooth crossing at u: Rice's formula on the cubic, give or take a bend [m]."""
+    """Log likelihood of a smooth crossing at u: Rice's formula on the cubic, give or take a bend [m].
+
+    The rate is a Brownian motion between both ends. Its variance is read off the change of velocity and the
+    way that both velocities do not explain: a hand that starts to move within the interval shows in both.
+    """
     h00, h10, h01, h11 = 2 * u**3 - 3 * u**2 + 1, u**3 - 2 * u**2 + u, -2 * u**3 + 3 * u**2, u**3 - u**2
     d00, d10, d01, d11 = 6 * u**2 - 6 * u, 3 * u**2 - 4 * u + 1, -6 * u**2 + 6 * u, 3 * u**2 - 2 * u
     value = h00 * c.left + h10 * h * c.v_left + h01 * c.right + h11 * h * c.v_right
     slope = (d00 * c.left + d01 * c.right) / h + d10 * c.v_left + d11 * c.v_right
     unseen = c.right - c.left - h * (c.v_left + c.v_right) / 2
-    bend = float(np.hypot(BEND * h * np.hypot(c.v_right - c.v_left, c.sd_v), UNSEEN * unseen))
+    wandered = (h**2 * ((c.v_right - c.v_left) ** 2 + c.sd_v**2) + 12 * unseen**2) / 2
     variance = (h00 * c.sd_left) ** 2 + (h01 * c.sd_right) ** 2
-    variance += (h * c.sd_v) ** 2 * (h10**2 + h11**2) + (4 * u * (1 - u) * bend) ** 2
-    rise = np.hypot(slope, c.sd_v + bend / h)
+    variance += (h * c.sd_v) ** 2 * (h10**2 + h11**2) + wandered * (u * (1 - u)) ** 3 / 3
+    rise = np.hypot(slope, c.sd_v + np.sqrt(wandered / 192) / h)
     return _log_normal(value, 0.0, np.sqrt(variance)) + np.log(rise * ndtr(slope / rise * 2))
 
 
@@ -231,38 +233,22 @@ def normal(mean: float, sd: float) -> BoundaryPosterior:
     return BoundaryPosterior(mean + sd * ndtri(NODES), np.full(POINTS, 1 / POINTS))
 
 
-def crossing_density(crossings: list[Crossing], width: float, first: bool = False) -> np.ndarray:
+def crossing_density(crossings: list[Crossing], width: float) -> np.ndarray:
     """Density (POINTS,), summing to 1, of the time in an interval of `width` s at which all have crossed.
 
-    With several crossings (two fingers that touch) the boundary is the last of them, or if stated the
-    `first`; without any the density is uniform. Unseen for long, motions may begin and end otherwise.
+    Several crossings are fingers that touch, and the boundary is the last of them; without any the density is
+    uniform. Unseen for long, motions may begin and end otherwise.
     """
     if not crossings:
         return np.full(POINTS, 1.0 / POINTS)
-    if first:
-        crossed = 1 - np.prod([1 - _crossed(c, width) for c in crossings], axis=0)
-    elif all(c.kind == "impact" for c in crossings):
-        crossed = last_impact(crossings, width)
+    if crossings[0].kind == "impact":
+        density = np.diff(last_impact(crossings, width), prepend=0.0)
     else:
-        crossed = np.prod([_crossed(c, width) for c in crossings], axis=0)
-    density = np.diff(crossed, prepend=0.0)
+        shapes = {"smooth": log_smooth, "landing": log_landing, "launch": log_launch}
+        log_density = shapes[crossings[0].kind](crossings[0], width, NODES)
+        density = np.exp(log_density - log_density.max())
     anywhere = 1 - (1 - UNIFORM) * np.exp(-max(width - MOTION[0], 0.0) / MOTION[1])
     return (1 - anywhere) * density / density.sum() + anywhere / POINTS
-
-
-def _crossed(c: Crossing, h: float) -> np.ndarray:
-    """Probability (POINTS,) that one crossing has occurred by each node of an interval of h s."""
-    if c.kind == "impact":
-        return last_impact([c], h)
-    shapes = {"smooth": log_smooth, "landing": log_landing, "launch": log_launch}
-    log_density = shapes[c.kind](c, h, NODES)
-    density = np.exp(log_density - log_density.max())
-    return np.cumsum(density / density.sum())
-
-
-def first_of(crossings: list[Crossing], width: float) -> np.ndarray:
-    """Density (POINTS,) of the time of the first crossing."""
-    return crossing_density(crossings, width, first=True)
 
 
 def evenly(t: np.ndarray, interval_probability: np.ndarray) -> BoundaryPosterior:

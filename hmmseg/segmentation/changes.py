@@ -36,7 +36,6 @@ from hmmseg.segmentation.boundaries import (
     Kind,
     blurred,
     crossing_density,
-    first_of,
 )
 
 STRAY = 0.02  # prior: share of samples at which one sensor contradicts the model (ringing, a pushed block)
@@ -153,8 +152,8 @@ class Prior:
 class Change:
     """Contacts made or broken at one boundary: the last of two made, or the first of two broken, decides.
 
-    `timing` [s]: uncertainty of the forces' clock. `slips` [m]: penetration at which each broken contact
-    slides.
+    `timing` [s]: uncertainty of the forces' clock. `slips` [m]: deepest penetration at which each broken
+    contact may slide.
     """
 
     contacts: tuple[Penetration, ...]
@@ -226,66 +225,81 @@ def _discrepancy(changes: Sequence[Change]) -> float:
     return float(np.sqrt((apart.size * excess + KNOWN * DISCREPANCY**2) / (apart.size + KNOWN)))
 
 
-VIEWS = (0.6, 0.2, 0.2)  # prior: a grip ends when its force vanishes, when it slides, when it has opened
-FRICTION = 0.1  # prior: relative variation of friction between contacts
+SLIDES = 0.2  # prior: share of grips that end as a pad slides, which comes off and meets the block again
+ENDS = (np.arange(5) + 0.5) / 5  # numerics: nodes of where these end
 
 
 def moment(change: Change, discrepancy: float = DISCREPANCY) -> BoundaryPosterior:
     """Posterior of the time of a change, given the `discrepancy` [m] of its sort.
 
-    A grip may end when a pad's friction is spent and it starts to slide, when its force vanishes, or when the
-    fingers have opened as far as the pads were compressed: a pad that slides comes off and meets the block
-    again for some ms. Where these differ, the posterior is their mixture (VIEWS).
+    A grip ends when its force vanishes, or (SLIDES) as a pad whose friction is spent slides and comes off for
+    some ms. The friction seen in a recording is a lower bound, so that this is anywhere between the
+    penetration at which it would be spent and none.
 
     The later of two touches comes when the fingers are the block's width apart: the first pushes the block.
     """
     contacts = [replace(c, sd_place=float(np.hypot(c.sd_place, discrepancy))) for c in change.contacts]
-    views, weight = [contacts], (1.0,)
-    if change.slips:
-        sliding = [  # penetration beyond that at which they slide
-            replace(c, pressed=np.maximum(c.pressed - slip, 0.0), place=c.place - slip,
-                    sd_place=float(np.hypot(c.sd_place, FRICTION * slip)))
-            for c, slip in zip(contacts, change.slips, strict=True)
+    views, weight, seen = [contacts], [1.0], _made if change.making else _broken
+    if any(change.slips):
+        views += [
+            [replace(c, pressed=np.maximum(c.pressed - end * slip, 0.0), place=c.place - end * slip)
+             for c, slip in zip(contacts, change.slips, strict=True)]
+            for end in ENDS
         ]  # fmt: skip
-        opened = [replace(c, pressed=np.full_like(c.pressed, np.nan), hidden=True) for c in contacts]
-        views, weight = [contacts, sliding, opened], VIEWS
-    seen, t = [_seen(view, change) for view in views], contacts[0].t
+        weight = [1 - SLIDES, *[SLIDES / ENDS.size] * ENDS.size]
+    found, t = [seen(view, change) for view in views], contacts[0].t
     sd = float(np.hypot(ONSET, change.timing))
-    times = np.concatenate([times for times, _ in seen])
-    masses = np.concatenate([w * mass / mass.sum() for w, (_, mass) in zip(weight, seen, strict=True)])
+    times = np.concatenate([times for times, _ in found])
+    masses = np.concatenate([w * mass / mass.sum() for w, (_, mass) in zip(weight, found, strict=True)])
     return blurred(times, masses, float(t[0]), float(t[-1]), sd)
 
 
-def _seen(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, np.ndarray]:
-    """Times [s] and masses of the moment when all contacts are made, or the first is broken."""
-    t, making = contacts[0].t, change.making
-    switches = np.array([switch_probability(c, change.log_prior, making) for c in contacts])
-    combined = crossing_density if making else first_of
+def _broken(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and masses of the moment when the first contact is broken.
+
+    One hand opens both: what is unknown of its motion, its places and its pads delays or advances both, so
+    the first is the one that tends to be earlier. If independent, it would come out early by half a standard
+    deviation.
+    """
+    t = contacts[0].t
+    switches = np.array([switch_probability(c, change.log_prior, False) for c in contacts])
+    likely = np.flatnonzero(switches.max(axis=0) >= LIKELY)
+    pairs = zip(contacts, switches, strict=True)
+    masses = [[switched[n] * _density([c], int(n), change) for n in likely] for c, switched in pairs]
+    broken = np.cumsum(np.reshape(masses, (len(contacts), -1)), axis=1)
+    first = (broken / broken[:, -1:]).max(axis=0)
+    return (t[likely, None] + NODES * np.diff(t)[likely, None]).ravel(), np.diff(first, prepend=0.0)
+
+
+def _made(contacts: Sequence[Penetration], change: Change) -> tuple[np.ndarray, np.ndarray]:
+    """Times [s] and masses of the moment when all contacts are made."""
+    t = contacts[0].t
+    switches = np.array([switch_probability(c, change.log_prior, True) for c in contacts])
     times, masses = [], []
     for n in range(t.size - 1):
-        width = float(t[n + 1] - t[n])
-        for chosen, mass in _shares(switches, n, making):
-            if mass < LIKELY:
-                continue
-            deciding = [_crossing(contacts[i], n, change) for i in chosen]
-            density = combined(deciding if all(x.known for x in deciding) else [], width)
-            if not np.isfinite(density).all():
-                density = combined([], width)
-            times.append(t[n] + NODES * width)
-            masses.append(mass * density)
+        for chosen, mass in _shares(switches, n):
+            if mass >= LIKELY:
+                times.append(t[n] + NODES * (t[n + 1] - t[n]))
+                masses.append(mass * _density([contacts[i] for i in chosen], n, change))
     return np.concatenate(times), np.concatenate(masses)
 
 
-def _shares(switches: np.ndarray, n: int, making: bool) -> list[tuple[tuple[int, ...], float]]:
-    """Which contacts decide the boundary in interval n, and with what probability.
+def _density(contacts: Sequence[Penetration], n: int, change: Change) -> np.ndarray:
+    """Density over the nodes of interval n, in which these contacts are made or one is broken."""
+    crossings, width = [_crossing(c, n, change) for c in contacts], float(np.diff(contacts[0].t)[n])
+    density = crossing_density(crossings if all(x.known for x in crossings) else [], width)
+    return density if np.isfinite(density).all() else crossing_density([], width)
 
-    `switches` (num_contacts, num_intervals): independent switch probabilities. Two contacts made in one
-    interval decide jointly, otherwise the later one; of contacts broken, the earlier.
+
+def _shares(switches: np.ndarray, n: int) -> list[tuple[tuple[int, ...], float]]:
+    """Which touches decide the boundary in interval n, and with what probability.
+
+    `switches` (num_contacts, num_intervals): independent switch probabilities. Two touches in one interval
+    decide jointly, otherwise the later one.
     """
     if len(switches) == 1:
         return [((0,), float(switches[0, n]))]
-    done = switches[:, :n].sum(axis=1) if making else switches[:, n + 1 :].sum(axis=1)
-    a, b = switches[:, n]
+    (a, b), done = switches[:, n], switches[:, :n].sum(axis=1)
     return [((0, 1), float(a * b)), ((0,), float(a * done[1])), ((1,), float(b * done[0]))]
 
 

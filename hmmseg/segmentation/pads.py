@@ -48,6 +48,7 @@ from hmmseg.segmentation.stretches import (
     ringing,
     steepest,
     stretches,
+    trust,
 )
 
 STEP = 0.0025  # numerics: s; step at which distances and filters are evaluated
@@ -59,8 +60,10 @@ LATE_HANDS = 0.007  # prior: share of hands whose sensors delay their forces
 ENOUGH = 24  # numerics: squeezes that determine a delay
 PROBES = 8  # numerics: white noises that show how far joining and filtering average noise
 COMPLIANCES = np.geomspace(0.33, 3.0, 17)  # numerics: multiples of the nominal compliance
+NEAR = np.geomspace(0.75, 1.33, 49)  # numerics: multiples of the likeliest of these, under late forces
 UNSTATED = np.geomspace(4e-5, 1.2e-3, 17)  # numerics: m/N; compliances of nominally rigid pads
 LAW_SHARE, LAW_LEAD = 0.05, 0.0015  # prior: relative deviation of a pad's force from its law, and lead [s]
+SOFT = 2e-4  # prior: m/N; sd of the compliance of nominally rigid pads
 HOLD = 0.75  # chosen: share of a squeeze's firmest load above which the block is held
 FIRMEST = 0.95  # numerics: quantile of the loads
 SLOWEST_SD = 3e-5  # prior: m; noise of a distance that neither rig nor recording gives
@@ -98,12 +101,16 @@ def squeeze(s: Signals, start: float, end: float, p: Parameters) -> Squeeze | No
 
 @dataclass(frozen=True)
 class Lateness:
-    """Delay of the forces: `delay` [s], its sd, whether it is the sensor's, and whether by a filter."""
+    """Delay of the forces: `delay` [s], its sd, whether it is the sensor's, and whether by a filter.
+
+    `compliance` [m/N] of a pad under such forces, and its sd.
+    """
 
     delay: float = 0.0
     sd: float = LEAD_SD
     late: bool = False
     filter: bool = False
+    compliance: tuple[float, float] = (0.0, SOFT)
 
 
 def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Lateness:
@@ -117,32 +124,39 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Latenes
     ]  # misread forces may pull
     if not squeezes:
         return Lateness()
-    compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED
-    log_prior = -(((compliances - prior[0]) / prior[1]) ** 2) / 2
-    loads = [_loads(s, compliances) for s in squeezes]
     noises = [_noise(s.t) for s in squeezes]
 
-    def profiled(values: np.ndarray, filtered: bool) -> np.ndarray:
-        """Log-likelihoods (len(values),) of shifts, or of time constants of a filter [s]."""
-        total = log_prior[:, None]
-        for s, own, white in zip(squeezes, loads, noises, strict=True):
-            load, pace = _late(s.t, own, values, filtered)
+    def likelihoods(compliances: np.ndarray, values: np.ndarray, filtered: bool) -> np.ndarray:
+        """Log-likelihoods (C, len(values)) of compliances and shifts, or time constants of a filter [s]."""
+        total = -(((compliances - prior[0]) / prior[1]) ** 2)[:, None] / 2
+        for s, white in zip(squeezes, noises, strict=True):
+            load, pace = _late(s.t, _loads(s, compliances), values, filtered)
             left = np.mean(_late(s.t, white, values, filtered) ** 2, axis=(0, 1))
             total = total + _log_likelihood(s, compliances, load, pace, left)
-        return total.max(axis=0)
+        return total
 
+    compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED
     log_lead = -((FINE / LEAD_SD) ** 2) / 2
-    usual = profiled(FINE, False) + log_lead - np.logaddexp.reduce(log_lead)
-    families = [(values, profiled(values, filtered) - np.log(2 * values.size), filtered)
+    usual = likelihoods(compliances, FINE, False) + log_lead - np.logaddexp.reduce(log_lead)
+    families = [(values, likelihoods(compliances, values, filtered) - np.log(2 * values.size), filtered)
                 for values, filtered in ((SHIFTS, False), (CONSTANTS, True))]  # fmt: skip
-    evidence = [float(np.logaddexp.reduce(log_weight)) for _, log_weight, _ in families]
-    late = np.logaddexp.reduce(evidence) - np.logaddexp.reduce(usual) > decisive(LATE_HANDS)
-    values, log_weight, filtered = families[int(np.argmax(evidence))] if late else (FINE, usual, False)
+    evidence = [float(np.logaddexp.reduce(table.max(axis=0))) for _, table, _ in families]
+    late = np.logaddexp.reduce(evidence) - np.logaddexp.reduce(usual.max(axis=0)) > decisive(LATE_HANDS)
+    values, table, filtered = families[int(np.argmax(evidence))] if late else (FINE, usual, False)
+    mean, sd = _moments(values, table.max(axis=0))
+    if not late:
+        return Lateness(mean, sd)
+    near = compliances[table.max(axis=1).argmax()] * NEAR
+    table = likelihoods(near, values, filtered)
+    return Lateness(mean, sd, True, filtered, _moments(near, np.logaddexp.reduce(table, axis=1)))
+
+
+def _moments(values: np.ndarray, log_weight: np.ndarray) -> tuple[float, float]:
+    """Mean and sd of a quantity known at these values."""
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     mean = float(weight @ values)
-    sd = float(np.sqrt(weight @ (values - mean) ** 2 + np.min(np.diff(values)) ** 2 / 12))
-    return Lateness(mean, sd, bool(late), filtered)
+    return mean, float(np.sqrt(weight @ (values - mean) ** 2 + np.min(np.diff(values)) ** 2 / 12))
 
 
 def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
@@ -210,7 +224,6 @@ def _log_likelihood(
 
 STIFFNESS_SD = 0.3  # prior: relative sd of a stiffness if the rig gives none: foams of one make differ so
 RIGID = 2e-5  # chosen: m/N; a stiffer pad hides its compression from any force sensor
-SOFT = 2e-4  # prior: m/N; sd of the compliance of nominally rigid pads
 FORM, FORM_STRETCHES = 0.05, 4.0  # prior: usual form error of foam, worth this many stretches
 BETWEEN = 0.15  # prior: share of a sample interval by which corrected forces may be off in time
 REACH = 0.4  # numerics: s of free motion used before and after a hold: the longest delay, and a touch
@@ -362,22 +375,23 @@ def sense(
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
     timing, toe = lateness(felt, priors[0]), NONE
-    lead = 0.0 if timing.late else timing.delay
+    lead, unknown = 0.0 if timing.late else timing.delay, timing.sd
     if not again:  # corrected forces, or a wrist's, are too coarse for a toe
-        toe = find_toe([(*reading(s, lead), s.sd) for s in grips])
+        toe = find_toe([(*reading(s, lead)[:2], s.sd) for s in grips])
         if toe is not NONE:  # a toe explains an apparent delay
             grips, lead = [replace(s, toe=toe) for s in grips], 0.0
             timing = timing if timing.late else Lateness()
     normal, shear = (
-        _compliance([(*reading(s, lead), s.sd) for s in own], prior, float(r))
+        _compliance([_while_moving(s, lead, unknown) for s in own], prior, float(r))
         for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)
     )
-    normal = replace(normal, toe=toe)
+    # Late loads of a stretch are not those of its places.
+    normal = Compliance(*timing.compliance, FORM) if timing.late else replace(normal, toe=toe)
     between = BETWEEN * float(np.median([np.median(np.diff(s.t)) for s in signals])) if timing.late else 0.0
     doubt = float(np.sqrt(timing.sd**2 + (LATE_SHARE * timing.delay * timing.late) ** 2 + between**2))
     friction = float(np.quantile(ratios, LARGEST)) if ratios else np.inf
     heights = [
-        place + shear.value * load for load, place in (reading(s, lead) for s in loads) if load.size > 3
+        place + shear.value * load for load, place, _ in (reading(s, lead) for s in loads) if load.size > 3
     ]
     rests = np.concatenate([np.zeros(0), *(height - np.median(height) for height in heights)])
     noise = (float(np.median([own.sd for own in loads] or [SLOWEST_SD])),
@@ -402,8 +416,14 @@ def _with_free_motion(
     return ends[0], ends[1]
 
 
+def _while_moving(s: Stretch, lead: float, doubt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Loads, places and their noise (M,): moving, these are off by what is unknown of the delay [s]."""
+    load, place, pace = reading(s, lead)
+    return load, place, np.hypot(s.sd, pace * doubt)
+
+
 def _compliance(
-    readings: Sequence[tuple[np.ndarray, np.ndarray, float]], prior: tuple[float, float],
+    readings: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray | float]], prior: tuple[float, float],
     ringing: float = 0.0,
 ) -> Compliance:  # fmt: skip
     """Common compliance of all stretches, each with its own rest; `prior`: mean and sd [m/N].
@@ -429,7 +449,9 @@ def _compliance(
     return Compliance(value, float(total**-0.5), float(np.sqrt(between)) / max(value, RIGID))
 
 
-def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tuple[float, float, float]:
+def _slope(
+    load: np.ndarray, place: np.ndarray, sd: np.ndarray | float, ringing: float
+) -> tuple[float, float, float]:
     """Compliance [m/N] of one stretch, its information, and its error in common with other stretches.
 
     Loads that ring, by at least `ringing` [N], while nothing moves flatten the line of places over loads, in
@@ -438,9 +460,11 @@ def _slope(load: np.ndarray, place: np.ndarray, sd: float, ringing: float) -> tu
     slope, weight = fit_slope(load, place, sd)
     if weight == 0:
         return slope, 0.0, 0.0
-    x, y = load - load.mean(), place.mean() - place
+    own, least = trust(sd, load.size), float(np.min(sd))
+    root = np.sqrt(own)
+    x, y = root * (load - np.average(load, weights=own)), root * (np.average(place, weights=own) - place)
     square, free = float(x @ x), load.size - 2.0
-    middle, apart = slope_between(square, float(x @ y), float(y @ y), free, (ringing, sd))
+    middle, apart = slope_between(square, float(x @ y), float(y @ y), free, (ringing, least))
     if not np.isfinite(apart):
         return middle, 0.0, 0.0
     value = middle if apart else slope

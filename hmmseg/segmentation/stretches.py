@@ -134,7 +134,7 @@ class Stretch:
     """Samples (N,) in contact at rest, with times t [s] and loads [N], and values around them.
 
     `interval` [s]: median time between samples. `place` (M,): values at `clock` (M,) [s], `sd` [m] their
-    noise. A `toe` is removed when the contact is read.
+    noise, `pace` (M,) [m/s] how fast they change. A `toe` is removed when the contact is read.
     """
 
     t: np.ndarray
@@ -143,6 +143,7 @@ class Stretch:
     clock: np.ndarray
     place: np.ndarray
     sd: float
+    pace: np.ndarray
     toe: Toe = NONE
 
 
@@ -162,9 +163,9 @@ def stretches(
     resting = fy < min(SUPPORTED * weight, weight - 3 * noise)
     pressing = inside & (fx1 > SURE * sd_force) & (-fx2 > SURE * sd_force)
     out = list[Stretch | None]()
-    for load, value, stated, within in (
-        (fx1 - fx2, s.distance, 2 * s.sd_x / np.sqrt(2), True),
-        (-fy / 2, s.y, s.sd_y / np.sqrt(2), resting),
+    for load, value, rate, stated, within in (
+        (fx1 - fx2, s.distance, s.vx2 - s.vx1, 2 * s.sd_x / np.sqrt(2), True),
+        (-fy / 2, s.y, s.vy, s.sd_y / np.sqrt(2), resting),
     ):
         use = pressing & within & np.isfinite(load)
         there = np.isfinite(value)
@@ -174,7 +175,8 @@ def stretches(
         interval = float(np.median(np.diff(s.t, prepend=2 * s.t[0] - s.t[1])[use]))
         sd, t = channel_sd(stated, value), s.t[use]
         there &= (s.t >= t[0] - FARTHEST) & (s.t <= t[-1] + FARTHEST)
-        out.append(Stretch(t, load[use], interval, s.t[there], value[there], max(sd, 1e-9)))
+        pace = np.abs(np.nan_to_num(rate[there]))
+        out.append(Stretch(t, load[use], interval, s.t[there], value[there], max(sd, 1e-9), pace))
     return out[0], out[1]
 
 
@@ -211,8 +213,8 @@ def ringing(s: Signals, start: float, end: float, p: Parameters) -> list[tuple[f
     return [(float(np.hypot(x1, x2)), float(np.hypot(y1, y2)) / 2, float(np.hypot(swing1, swing2)))]
 
 
-def reading(s: Stretch, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Corresponding loads and values (M,) for forces that are `shift` s late.
+def reading(s: Stretch, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corresponding loads and values (M,), and paces, for forces that are `shift` s late.
 
     Loads are interpolated to the times of the values, whose noise matters more; up to the shift beyond the
     first and the last, which are the most informative, they are extrapolated. A toe is removed from the
@@ -220,22 +222,24 @@ def reading(s: Stretch, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """
     t, late = s.t, s.clock + shift
     if t.size < 2:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     after = np.clip(np.searchsorted(t, late), 1, t.size - 1)
     step, edge = np.diff(t)[after - 1], abs(shift) + 1e-9
     # Linear between two loads, and beyond the first and the last.
     load = s.load[after - 1] + (s.load[after] - s.load[after - 1]) * ((late - t[after - 1]) / step)
     within = (late >= t[0] - edge) & (late <= t[-1] + edge) & (step < 1.5 * s.interval)
-    return load[within], s.place[within] + s.toe.give(load[within])
+    return load[within], s.place[within] + s.toe.give(load[within]), s.pace[within]
 
 
-def fit_slope(load: np.ndarray, value: np.ndarray, sd: float) -> tuple[float, float]:
+def fit_slope(load: np.ndarray, value: np.ndarray, sd: np.ndarray | float) -> tuple[float, float]:
     """Slope -dvalue/dload of samples (N,) and its information; Student-t, reweighted.
 
-    Noise of the loads, bounded by the residual of the values, would flatten the slope by its share of their
-    variance, which counts as uncertainty. Both are 0 for fewer than four samples, or equal loads.
+    `sd`: noise of the values. Noise of the loads, bounded by the residual of the values, would flatten the
+    slope by its share of their variance, which counts as uncertainty. Both are 0 for fewer than four samples,
+    or equal loads.
     """
-    weight, slope, information = np.ones(load.size), 0.0, 0.0
+    own = trust(sd, load.size)
+    weight, slope, information = own, 0.0, 0.0
     for _ in range(ROUNDS - 1 if load.size > 3 else 0):
         x, y = (v - np.average(v, weights=weight) for v in (load, value))
         square = float(weight @ x**2)
@@ -243,8 +247,13 @@ def fit_slope(load: np.ndarray, value: np.ndarray, sd: float) -> tuple[float, fl
             return 0.0, 0.0
         slope = -float((weight * x) @ y) / square
         left = (y + slope * x) ** 2
-        scale2 = max(float(weight @ left) / (load.size - 2), sd**2)
-        weight = (TAIL + 1) / (TAIL + left / scale2)
+        scale2 = max(float(weight @ left) / (load.size - 2), float(np.min(sd)) ** 2)
+        weight = own * (TAIL + 1) / (TAIL + own * left / scale2)
         flattened = slope * min(scale2 * float(weight.sum()) / max(slope**2 * square, 1e-300), 1.0)
         information = 1 / (scale2 / square + flattened**2)
     return slope, information
+
+
+def trust(sd: np.ndarray | float, size: int) -> np.ndarray:
+    """Weights (size,) of samples with this noise, 1 for the best."""
+    return (np.min(sd, initial=np.inf) / sd) ** 2 * np.ones(size)

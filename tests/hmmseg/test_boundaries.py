@@ -12,7 +12,6 @@ from hmmseg.hand.signals import task_space
 from hmmseg.segmentation import boundaries, changes
 from hmmseg.segmentation.boundaries import (
     POINTS,
-    UNIFORM,
     Crossing,
     _minimum_jerk,
     _minimum_jerk_slope,
@@ -23,6 +22,7 @@ from hmmseg.segmentation.pads import Compliance, Sensing
 from hmmseg.segmentation.posteriors import contacts
 
 WIDTH = 0.05
+PHASES = np.linspace(0, 1, 10_001)
 NODES = (np.arange(POINTS) + 0.5) / POINTS * WIDTH
 SOME = [Crossing(-1e-3, 1e-3, 0.04, 0.04, 1e-4, 1e-4, 2e-3),
         Crossing(-1e-3, 2e-4, 0.05, 0.0, 3e-5, 3e-6, 2e-3, "impact"),
@@ -45,11 +45,11 @@ def quantiles(density, levels):
     return np.interp(levels, np.cumsum(density) - density / 2, NODES)
 
 
-@pytest.mark.parametrize("combined", [crossing_density, boundaries.first_of])
-def test_densities_are_normalised_and_without_a_crossing_nothing_is_known(combined):
-    np.testing.assert_allclose(combined([], WIDTH), 1 / POINTS)
-    for crossings in (own for c in SOME for own in ([c], [c, SOME[0]], [c, c, c])):
-        density = combined(crossings, WIDTH)
+@pytest.mark.parametrize("c", SOME, ids=lambda c: c.kind)
+def test_densities_are_normalised_and_without_a_crossing_nothing_is_known(c):
+    np.testing.assert_allclose(crossing_density([], WIDTH), 1 / POINTS)
+    for crossings in ([c], [c, c] if c.kind == "impact" else [c]):
+        density = crossing_density(crossings, WIDTH)
         assert density.shape == (POINTS,) and (density > 0).all()
         np.testing.assert_allclose(density.sum(), 1.0, rtol=1e-12)
 
@@ -64,19 +64,6 @@ def test_without_noise_the_root_is_found(kind, root):
     near = 1.645 * sd[kind] + 0.001 + WIDTH / POINTS
     assert density[np.abs(NODES - root) < near].sum() > 0.8
     assert quantiles(density, 0.5) == pytest.approx(root, abs=0.001 + 0.5 * sd[kind])
-
-
-def test_last_and_first_of_two_against_monte_carlo():
-    # Broad enough that the grid of nodes resolves them.
-    ends = ((-1.2e-3, 8e-4), (-7e-4, 1.3e-3))
-    pair = [Crossing(*values, 0.04, 0.04, 3e-4, 3e-4, 1e-3) for values in ends]
-    rng, num = np.random.default_rng(0), 100_000
-    parts = [(crossing_density([c], WIDTH) - UNIFORM / POINTS) / (1 - UNIFORM) for c in pair]
-    drawn = [rng.choice(POINTS, size=num, p=p / p.sum()) for p in parts]
-    for combined, chosen in ((crossing_density, np.maximum), (boundaries.first_of, np.minimum)):
-        expected = np.bincount(chosen(*drawn), minlength=POINTS) / num
-        found = combined(pair, WIDTH)
-        np.testing.assert_allclose(found, (1 - UNIFORM) * expected + UNIFORM / POINTS, atol=5e-3)
 
 
 def test_moments_are_of_the_distribution_and_without_knowledge_of_the_interval():
@@ -117,8 +104,7 @@ def smooth_case(rng):
 def touches(rng, width, num=1):
     """Time at which all of `num` fingers that move as one, by minimum jerk, have hit, and their crossings."""
     sd_left, sd_right, sd_v = 4e-5, 5e-6, 2e-3
-    phases = np.linspace(0, 1, 10_001)
-    at_hit = np.interp(rng.uniform(), _minimum_jerk(phases), phases)
+    at_hit = np.interp(rng.uniform(), _minimum_jerk(PHASES), PHASES)
     duration, root = np.exp(rng.uniform(*np.log(boundaries.MOTION))), rng.uniform(0, width)
     phase = at_hit - root / duration
     distance = np.exp(rng.uniform(*np.log([0.004, 0.02])))
@@ -165,6 +151,17 @@ def test_touches_of_two_fingers_that_move_as_one(width):
     assert abs(late) < 0.015 * width, late
 
 
+def opening(rng):
+    """Fingers that open fast, by minimum jerk, from rest on their pads, perhaps within the interval."""
+    way, duration = rng.uniform(6e-3, 12e-3), rng.uniform(0.05, 0.09)
+    at_end = np.interp(rng.uniform(2e-4, 8e-4) / way, _minimum_jerk(PHASES), PHASES)
+    root = rng.uniform(0, WIDTH)
+    ends = at_end + np.array([-root, WIDTH - root]) / duration
+    values = way * (_minimum_jerk(ends) - _minimum_jerk(at_end)) + np.array([3e-6, 5e-5]) * rng.normal(size=2)
+    rates = way / duration * _minimum_jerk_slope(ends) + 3e-3 * rng.normal(size=2)
+    return root, Crossing(*values, *rates, 3e-6, 5e-5, 3e-3)
+
+
 def rebounding(rng):
     """A touch by a hand of 0.14 kg that hits a pad of 3000 N/m at 0.1 to 0.4 m/s: when, and its ends."""
     duration, way = rng.uniform(0.08, 0.14), rng.uniform(0.01, 0.02)
@@ -197,7 +194,8 @@ def wandering(rng, spread=1.0):
 
 
 @pytest.mark.parametrize(("case", "seed", "num"), [(smooth_case, 3, 600), (impact_case, 3, 600),
-                                                   (rebounding, 6, 300), (wandering, 6, 300)])  # fmt: skip
+                                                   (opening, 3, 600), (rebounding, 6, 300),
+                                                   (wandering, 6, 300)])  # fmt: skip
 def test_ninety_percent_intervals_cover(case, seed, num):
     share = coverage(case, np.random.default_rng(seed), num)
     # Wider than nominal by design: bends that the cubic misses, a uniform part.
@@ -314,11 +312,32 @@ def test_a_grip_that_slides_before_it_ends_may_have_ended_then_and_another_ends_
     slides = float(np.interp(-3e-4, -place, T))  # 1e-2 m/s: 30 ms before it is spent
     spent = float(np.interp(0.0, -place, T))
     found, plain = moment(change, known), moment(release(99), known)
-    assert found.quantile(0.05) < slides + 2e-3 and found.quantile(0.95) > spent - 2e-3
-    assert plain.quantile(0.05) > slides + 10e-3 and abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
+    assert found.quantile(0.01) < slides + 5e-3 and found.quantile(0.95) > spent - 2e-3
+    assert plain.quantile(0.01) > slides + 10e-3 and abs(found.quantile(0.5) - plain.quantile(0.5)) < 5e-3
+    # Seen friction is a lower bound, so all moments from its being spent until the force vanishes may be it.
+    between = [np.interp(t, found.times, np.cumsum(found.probabilities)) for t in (slides, spent - 8e-3)]
+    assert 0.1 < between[1] - between[0] < 0.25
     for seed in range(90, 95):
         found, plain = moment(release(seed, slip=0.0), known), moment(release(seed), known)
         assert abs(found.quantile(0.5) - plain.quantile(0.5)) < 1e-3 and found.sd < 1.5 * plain.sd
+
+
+def test_the_first_of_two_pads_opened_by_one_hand_is_not_early():
+    """What shifts the face of one pad, as a doubtful stiffness does, shifts that of the other."""
+    rows, sd = [], 1e-4
+    for seed in range(60):
+        change = release(seed)
+        (c,), rng = change.contacts, np.random.default_rng([seed, 1])
+        spent = float(np.interp(0.0, -c.place, T))
+        place = np.where(c.place < 0, c.place + sd * rng.standard_normal(), c.place)
+        pads = tuple(
+            replace(c, place=place, sd_place=sd, pressed=c.pressed + SD_PRESSED * rng.standard_normal(12))
+            for _ in range(2)
+        )
+        found = moment(replace(change, contacts=pads))
+        rows.append((found.quantile(0.5) - spent, found.quantile(0.05) < spent < found.quantile(0.95)))
+    early, held = np.mean(rows, axis=0)
+    assert abs(early) < 1e-3 and held > 0.85, (early, held)  # independent pads: 2 ms early
 
 
 def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():

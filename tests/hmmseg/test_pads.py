@@ -17,6 +17,7 @@ from hmmseg.segmentation.pads import (
     Squeeze,
     _compliance,
     _unfiltered,
+    _while_moving,
     lateness,
     read_again,
     resampled,
@@ -33,11 +34,11 @@ def squeeze(step=0.02, compliance=2.5e-4):
     load = np.interp(t, fine, force) + 0.012 * rng.standard_normal(t.size)
     clock = np.arange(0.0, 0.8, step)
     place = 0.02 - compliance * np.interp(clock, fine, force) + 2e-5 * rng.standard_normal(clock.size)
-    return Stretch(t, load, step, clock, place, 2e-5)
+    return Stretch(t, load, step, clock, place, 2e-5, np.abs(np.gradient(place, clock)))
 
 
 def test_slopes_and_toes_of_squeezes_are_found_where_there_are_any():
-    load, value = reading(squeeze())
+    load, value, _ = reading(squeeze())
     slope, information = fit_slope(load, value, 2e-5)
     assert slope == pytest.approx(2.5e-4, abs=4 * information**-0.5) and np.std(value + slope * load) < 4e-5
     assert fit_slope(load[:3], value[:3], 2e-5) == fit_slope(0 * load, value, 2e-5) == (0.0, 0.0)
@@ -60,6 +61,17 @@ def test_loads_that_ring_while_nothing_moves_say_little_of_the_pads():
     assert clean.value == pytest.approx(2.5e-4, abs=3 * clean.sd) and clean.sd < 0.2 * PRIOR[1]
 
 
+def test_a_fast_touch_tells_as_little_of_the_pads_as_is_known_of_the_delay():
+    t = np.arange(5) * 0.05
+    load, pace = np.array([10.9, 6.5, 6.52, 6.49, 6.5]), np.array([0.3, 0.0, 0.0, 0.0, 0.0])
+    place = 0.02 - 2.5e-4 * load - 1.3e-3 * pace + 2e-5 * np.random.default_rng(1).standard_normal(5)
+    s = Stretch(t, load, 0.05, t, place, 2e-5, pace)  # 1.3 ms late
+    found = _compliance([_while_moving(s, 0.0, 2e-3)], PRIOR)
+    assert abs(found.value - 2.5e-4) < 2 * found.sd < 2 * PRIOR[1]
+    surely = _compliance([_while_moving(s, 0.0, 1e-5)], PRIOR)
+    assert surely.value - 2.5e-4 > 4 * surely.sd  # had the delay been known
+
+
 def test_releases_of_grips_that_ring_are_not_early():
     _, task = scene()
     (judged,) = trials_of(WORLDS["ringing 1 N"], [78004])
@@ -79,7 +91,7 @@ def test_soft_pads_and_holds_in_which_misread_forces_pull_are_no_delay():
 @pytest.mark.parametrize("shift", [-0.003, 0.003])
 def test_a_small_delay_leaves_both_ends_of_a_contact(shift):
     s = squeeze()
-    load, place = reading(s, shift)
+    load, place, _ = reading(s, shift)
     assert load.size == place.size == s.t.size
     np.testing.assert_allclose(load, np.interp(s.t + shift, s.t, s.load), atol=0.2)  # 3 ms of a squeeze
     assert fit_slope(load, place, s.sd)[0] == pytest.approx(2.5e-4, rel=0.1)
@@ -98,6 +110,16 @@ def test_recorded_lag_is_found_and_said_and_healthy_forces_are_on_time():
     assert np.median(np.abs(residual)) < 0.012
     found, residual = world()
     assert found.remarks == () and np.median(np.abs(residual)) < 0.004
+
+
+def test_pads_under_filtered_forces_are_read_off_whole_grips():
+    _, task = scene()
+    filtered = World("", effects={"force_lowpass": {"time_constant": 0.03}})
+    for judged in trials_of(filtered, [78206, 78207]):
+        (found,) = segment([judged.trial], task, judged.rig)
+        ends = np.array([s.start for s in found.spans[1:]])
+        # Stretches of forces that are late made the pads twice as soft, and releases 30 ms late.
+        assert np.abs(ends - judged.boundaries).max() < 0.015 and "filtered" in found.remarks[0]
 
 
 def test_reading_again_undoes_what_was_found_and_smears_no_jump():
@@ -157,6 +179,9 @@ def test_a_delay_or_a_filter_is_found_and_they_are_told_apart(delay, constant, s
     found = lateness([whole_grip(delay, constant, step, seed=i) for i in range(4)], PRIOR)
     assert found.late and found.filter == (constant > 0)
     assert found.delay == pytest.approx(delay + constant, abs=0.006 + 0.2 * constant * (constant > 0))
+    if constant:
+        value, sd = found.compliance
+        assert abs(value - COMPLIANCE) < 3 * sd < 0.3 * COMPLIANCE
 
 
 @pytest.mark.parametrize(("delay", "prior"), [(0.0, PRIOR), (0.0, (0.0, 2e-4)), (-0.004, PRIOR),
