@@ -19,7 +19,10 @@ TICK = 1e-9  # numerics: s: rounding of equal times
 
 KINDS = ("effort", "duty", "place")  # of commands
 WORDS = {
-    "command.delay": ("commands that are carried out late", "Log commands and motion with one clock."),
+    "command.delay": (
+        "commands that are carried out late, or logged late",
+        "Log commands and motion with one clock.",
+    ),
     "supply.sag": (
         "torque that falls with the supply's voltage",
         "Measure the voltage at the drive under load.",
@@ -36,8 +39,9 @@ def candidates(setting: Setting) -> Iterator[RobotEffect]:
     for effect in channel_effects(*of).values():
         yield from (_of(setting, name, effect) for kind in effect.of for name in of.get(kind, ()))
     names = setting.commands()
-    if names:  # all commands hold their first value before the log's start
-        delay = Parameter(0.0, 0.01, "s", low=0.0, high=0.5)
+    if names:  # all commands hold their first value before the log's start, their last one after its end
+        # What is logged after it was carried out makes the delay negative.
+        delay = Parameter(0.0, 0.01, "s", low=-0.2, high=0.5)
         acts = getattr(setting.simulator, "acts", None)
         late = _late(names) if acts is None else _late_by_time(names, acts)
         yield RobotEffect("command.delay", "acted(t) = commanded(t - delay)", {"delay": delay}, command=late)
