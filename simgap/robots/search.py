@@ -44,7 +44,6 @@ LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, how many teach by how much proposals of replacements are wrong
 LEADERS = (16, 4)  # numerics: candidates that are rolled out where they fit best, and that once more
-ALONE_AGAIN = 4  # numerics: how often leading candidates are rolled out where nothing acts yet, at most
 NOTHING_NEW = 0.1  # numerics: usual sizes; a candidate is rolled out no nearer to where it was before
 USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
@@ -373,7 +372,7 @@ class Search:
             self.diverged = tuple(n for n in names if n not in linear.moved)
         base = base_at(composed, at.point)
         # Where the gap is large, one straight line leads only part of the way; it is largest without causes.
-        for count in LEADERS if held else ALONE_AGAIN * LEADERS[:1]:
+        for count in LEADERS if held else 2 * LEADERS[:1]:
             linear = self._roll_out_leaders(composed, base, linear, sets, levels, held, count)
             sets = self._sets(linear, levels, names)
         return sets, levels
@@ -443,7 +442,8 @@ class Search:
         """
         sets, levels = latest(self._proposed, at, lambda: self.propose(at, self.wanted))
         near = neighbours(at.names, sets.names)
-        near += pairs(at.names, sets.names) if at is best else []  # a replacement is a single effect
+        # A replacement is a single effect, and of a large gap lines promise too little of the first.
+        near += pairs(at.names, sets.names) if at is best and at.names else []
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
         own = max(sets.scores([at.names], level)[0] for level in range(len(levels)))
@@ -470,7 +470,8 @@ class Search:
                 least = max(least, -NEAR - wrong)
             if one.score > found.score and self._is_better(one, best):
                 found = one
-                if at is best and one.score > best.score + NEAR:  # others are better proposed about it
+                # Others are better proposed about it, if what it leaves is not that of a wrong first.
+                if at is best and one.score > best.score + NEAR and (at.names or not one.discrepancy):
                     break
         return None if found is best else found
 

@@ -68,6 +68,13 @@ def test_starts_are_right_within_what_they_say_and_of_a_jerk_read_as_such():
     assert abs(np.polyfit(x, values[47:54], 2)[1] - true) > 3 * sd
 
 
+def test_commands_that_were_logged_late_are_found_early():
+    plain = log(0)
+    late = plain.with_columns({"torque": np.append(plain["torque"][0], plain["torque"][:-1])})
+    early = composed([late]).effects["command.early"].command(late, {"early": 0.01})
+    assert early["torque"][:-1] == pytest.approx(plain["torque"][:-1], abs=1e-9)
+
+
 def test_what_is_read_late_at_a_windows_begin_is_what_went_before():
     plain = log(0, seconds=20.0, noise=0.0)
     jolts = 0.4 * np.sign(np.random.default_rng(1).standard_normal(200))[(plain.t / 0.1).astype(int)]
