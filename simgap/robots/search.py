@@ -44,6 +44,7 @@ LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, how many teach by how much proposals of replacements are wrong
 LEADERS = (16, 4)  # numerics: candidates that are rolled out where they fit best, and that once more
+FIRST_ROLLS = 4  # numerics: how often leading candidates are rolled out where nothing acts yet
 NOTHING_NEW = 0.1  # numerics: usual sizes; a candidate is rolled out no nearer to where it was before
 USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
@@ -372,7 +373,7 @@ class Search:
             self.diverged = tuple(n for n in names if n not in linear.moved)
         base = base_at(composed, at.point)
         # Where the gap is large, one straight line leads only part of the way; it is largest without causes.
-        for count in LEADERS if held else 2 * LEADERS[:1]:
+        for count in LEADERS if held else FIRST_ROLLS * LEADERS[:1]:
             linear = self._roll_out_leaders(composed, base, linear, sets, levels, held, count)
             sets = self._sets(linear, levels, names)
         return sets, levels
