@@ -217,7 +217,7 @@ def diagnose_robot(
     with show_stages(out, "diagnosing", STAGES) as tell:
         forced = tuple(dict.fromkeys(effect))
         found = diagnose(at_risk, recordings, forced=forced, seed=out.seed, more=more, length=length,
-                         phases=phases, tell=tell, warn=out.warn)  # fmt: skip
+                         phases=phases, tell=tell, warn=out.warn, note=out.print)  # fmt: skip
     document = body(found)
     warn_of_engine(out, own)
     headline, left = sentence(document), document["remainder"]["rms_over_noise"]

@@ -6,6 +6,7 @@ Each maps a recording to one with commands as the drives carried them out.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ TICK = 1e-9  # numerics: s: rounding of equal times
 KINDS = ("effort", "duty", "place")  # of commands
 WORDS = {
     "command.delay": ("commands that are carried out late", "Log commands and motion with one clock."),
+    "command.early": ("commands that are logged late", "Log commands as they are given, not a cycle later."),
     "supply.sag": (
         "torque that falls with the supply's voltage",
         "Measure the voltage at the drive under load.",
@@ -36,11 +38,17 @@ def candidates(setting: Setting) -> Iterator[RobotEffect]:
     for effect in channel_effects(*of).values():
         yield from (_of(setting, name, effect) for kind in effect.of for name in of.get(kind, ()))
     names = setting.commands()
-    if names:  # all commands hold their first value before the log's start
+    if names:  # all commands hold their first value before the log's start, their last one after its end
         delay = Parameter(0.0, 0.01, "s", low=0.0, high=0.5)
         acts = getattr(setting.simulator, "acts", None)
         late = _late(names) if acts is None else _late_by_time(names, acts)
         yield RobotEffect("command.delay", "acted(t) = commanded(t - delay)", {"delay": delay}, command=late)
+        # Not one with the delay, whose bound tells commands held in steps from those on lines.
+        early = {"early": replace(delay, high=0.2)}
+        yield RobotEffect(
+            "command.early", "acted(t) = commanded(t + early)", early,
+            command=lambda log, theta: late(log, {"delay": -theta["early"]}),
+        )  # fmt: skip
     yield from _sags(setting, every)
 
 

@@ -69,6 +69,7 @@ def diagnose(
     phases: Phases | None = None,
     tell: Progress = silent,
     warn: Progress = silent,
+    note: Progress = silent,
     more: Sequence[RobotEffect] = (),
     length: float | None = None,
     groups: Sequence[int] | None = None,
@@ -83,6 +84,7 @@ def diagnose(
         phases: Stretches of the logs by name; by motion and contact by default.
         tell: Called with a description of each stage.
         warn: Called at once with each warning.
+        note: Called early, with where the gap is and how large.
         more: Further candidates.
         length: Length of the windows [s].
         groups: A number for each log; logs of the same number are held out together.
@@ -115,7 +117,7 @@ def diagnose(
     every = [whole] if forced or (calm := whole.calm()) is whole else [calm, whole]
     for composed in every:
         found = _diagnosed(
-            composed.among(composed.thinned()), parts, calibrated, forced, seed, tell, warn, groups
+            composed.among(composed.thinned()), parts, calibrated, forced, seed, tell, warn, note, groups
         )
         if found.verdict.causes:
             break
@@ -130,6 +132,7 @@ def _diagnosed(
     seed: int,
     tell: Progress,
     warn: Progress,
+    note: Progress,
     groups: Sequence[int] | None,
 ) -> RobotDiagnosis:
     """The diagnosis along some of the windows."""
@@ -142,7 +145,7 @@ def _diagnosed(
     wanted = tuple(n for n, e in composed.effects.items() if not e.fitted)
     fold = folds_of(composed.rows, len(composed.recordings), groups)
     search = Search(composed, wanted, fold, lambda: calibrated(UNMEASURED))
-    best = search.forced(tuple(forced)) if forced else search.run(tell)
+    best = search.forced(tuple(forced)) if forced else search.run(tell, note)
     nothing = search.fitted[frozenset()]
     for name in search.diverged:
         said(f"{name}: the simulator diverges with it, and it is left out")

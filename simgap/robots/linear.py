@@ -158,7 +158,7 @@ def vary(
     here, rows, shift = now, base.rows, np.zeros(base.rows.size)
     if at is not None and name not in base.point:
         here = {**neutral, **at}
-        rows = _rows_at(composed, base, name, here)
+        rows = rows_at(composed, base, name, here)
         shift = rows - base.rows
     names, log, columns = [*effect.parameters], composed.rows.log, []
     sizes = np.full(len(names), STEP) if step is None else step
@@ -168,7 +168,7 @@ def vary(
     for kind in range(kinds):
         mine = names[kind::kinds]
         move = step_of(composed, name, mine[0], here[mine[0]], sizes[kind::kinds].min())
-        there = _rows_at(composed, base, name, {**here, **{n: here[n] + move for n in mine}})
+        there = rows_at(composed, base, name, {**here, **{n: here[n] + move for n in mine}})
         columns.append((there - rows) / move)
     if effect.by_log:
         columns = [np.where(log == i // kinds, columns[i % kinds], 0.0) for i in range(len(names))]
@@ -178,7 +178,7 @@ def vary(
         return None
     point = np.array([here[n] for n in effect.parameters])
     if name in base.point and shifted and not effect.fitted:
-        shift = base.rows - _rows_at(composed, base, name, neutral)
+        shift = base.rows - rows_at(composed, base, name, neutral)
         if not _bounded(shift[fine]):  # the straight line back, where neutral itself diverges
             shift = jacobian @ (point - np.array([neutral[n] for n in effect.parameters]))
     return Moved(point, shift, jacobian)
@@ -199,7 +199,7 @@ def with_wobble(composed: Composed, linear: Linear) -> Composed:
     return replace(composed, wobble=np.where(strikes[:, None] & np.isfinite(columns), columns, 0.0))
 
 
-def _rows_at(composed: Composed, base: Base, name: str, values: Mapping[str, float]) -> np.ndarray:
+def rows_at(composed: Composed, base: Base, name: str, values: Mapping[str, float]) -> np.ndarray:
     """Rows (N,) with one effect at other values. Starts are read through read-out effects, so that a large
     one moves them farther than along straight lines."""
     effect = composed.effects[name]

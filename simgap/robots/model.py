@@ -135,7 +135,8 @@ class Composed:
             starts: Start of each window, by state.
 
         Returns:
-            True channels of every window, before read-out effects; None where a rollout diverged.
+            True channels of every window from where it is run, before read-out effects; None where a rollout
+                diverged.
         """
         out = self._rolled(self._without_dear(point), self.windows, starts)
         for name, theta in point.items():
@@ -185,7 +186,7 @@ class Composed:
         recordings, parameters = self.commanded(point), self.parameters(point)
         jobs, leads = [], []
         for window, start in zip(windows, starts, strict=True):
-            along, lead = recordings[window.log].window(window.begin, window.end), 0
+            along, lead = recordings[window.log].window(window.first, window.end), 0
             if window.regime == RESTS:
                 along, lead = preceded_by_rest(along)
             jobs.append(Job(parameters, along, start))
@@ -200,13 +201,13 @@ class Composed:
         acting = [(e.alter, v) for e, v in self._acting(point) if e.alter is not None]
         out: list[Channels | None] = []
         for window, channels in zip(self.windows, true, strict=True):
-            if channels is None or not acting:
+            if channels is None or not (acting or window.lead):
                 out.append(channels)
                 continue
-            here, along = dict(channels), self.recordings[window.log].window(window.begin, window.end)
+            here, along = dict(channels), self.recordings[window.log].window(window.first, window.end)
             for alter, theta in acting:
                 here |= alter(along, here, theta)
-            out.append(here)
+            out.append({n: v[window.lead :] for n, v in here.items()})
         return out
 
     def starts(self, point: Point) -> list[Mapping[str, float] | None]:
@@ -222,7 +223,7 @@ class Composed:
         ]
         out: list[Mapping[str, float] | None] = []
         for w in self.windows:
-            mine = undone[w.log], w.begin, self.noise, w.forward, changed[w.log]
+            mine = undone[w.log], w.first, self.noise, w.forward, changed[w.log]
             out.append(None if w.start is None else w.begun(start_of(self.simulator, *mine)))
         return out
 

@@ -27,7 +27,7 @@ class Rows:
 
     `channels`: names of the compared channels; `log`, `channel`, `window`, `regime`: number (N,) of each
     row's log, channel, window and window's regime; `time`: times (N,) [s]; `since`: times (N,) [s] since the
-    window's first sample; `observed`: recorded values (N,) in the channel's unit; `variance`: variance (N,)
+    window is run; `observed`: recorded values (N,) in the channel's unit; `variance`: variance (N,)
     of their sensor noise; `of`: the rows of each window.
     """
 
@@ -91,7 +91,7 @@ def rows_of(recordings: Sequence[Recording], windows: Sequence[Window], noise: M
     averages, parts, of, at = [], [], [], 0
     for number, window in enumerate(windows):
         log = recordings[window.log].window(window.begin, window.end)
-        span = max(float(log.t[-1] - log.t[0]), 1e-9)
+        begun, span = recordings[window.log].t[window.first], max(float(log.t[-1] - log.t[0]), 1e-9)
         size = max(1, round(len(log) / max(span * RATE_LIMIT, 1.0)))
         first, values = np.arange(0, len(log), size), np.array([log[n] for n in names])
         finite = np.isfinite(values)
@@ -100,7 +100,7 @@ def rows_of(recordings: Sequence[Recording], windows: Sequence[Window], noise: M
         group, channel = np.nonzero(average.count.T)
         variance, n = sd[channel] ** 2 / average.count[channel, group], group.size
         of_window = np.full(n, window.log), channel, np.full(n, number), stamps[group]
-        parts.append((*of_window, stamps[group] - log.t[0], average(values), variance))
+        parts.append((*of_window, stamps[group] - begun, average(values), variance))
         averages.append(average)
         of.append(slice(at, at + n))
         at += n

@@ -21,10 +21,10 @@ from scipy.stats import t as student
 
 from simgap.attribution.verdict import RULED_OUT
 from simgap.latest import latest
-from simgap.progress import Progress, say
+from simgap.progress import Progress, say, silent
 from simgap.robots.calibrate import Calibration
-from simgap.robots.fit import fit_effects, prior_cost
-from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, vary, with_wobble
+from simgap.robots.fit import HALVINGS, fit_effects, prior_cost
+from simgap.robots.linear import Base, Linear, Moved, base_at, linearise, rows_at, vary, with_wobble
 from simgap.robots.model import Composed, Point
 from simgap.robots.sets import (
     Identifiability,
@@ -44,6 +44,8 @@ LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which
 TRIED = 4  # numerics: sets that are fitted exactly about one point
 LEARNED = 2  # numerics: of these, how many teach by how much proposals of replacements are wrong
 LEADERS = (16, 4)  # numerics: candidates that are rolled out where they fit best, and that once more
+FIRST_ROLLS = 4  # numerics: how often leading candidates are rolled out where nothing acts yet
+NOTHING_NEW = 0.1  # numerics: usual sizes; a candidate is rolled out no nearer to where it was before
 USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
@@ -143,10 +145,14 @@ class Search:
         share = min(EXPECTED / max(len(self.wanted), 1), 0.5)
         return float(np.log(share / (1 - share)))
 
-    def run(self, tell: Progress) -> FittedSet:
+    def run(self, tell: Progress, note: Progress = silent) -> FittedSet:
         """The best set, searched forwards from nothing and, where that leaves a gap, backwards from the
-        calibration."""
-        best = self._from(self.nothing(), tell)
+        calibration; `note`: told at once where the gap is and how large."""
+        best = self.nothing()
+        size = {n: v / best.noise**0.5 for n, v in best.linear.rows.rms(best.squares**0.5, best.fine).items()}
+        each = ", ".join(f"{n} {v:.3g}" for n, v in sorted(size.items(), key=lambda one: -one[1]))
+        note(f"the model as it came misses, in times the noise: {each}")
+        best = self._from(best, tell)
         if best.squares[best.fine].mean() > LEAVES * best.noise:
             tell("from the calibration")
             self.columns.clear()
@@ -199,39 +205,44 @@ class Search:
         """The best set that steps lead to."""
         for number in range(ROUNDS):
             tell(f"round {number + 1}: {' + '.join(best.names) or 'nothing'}")
-            better = self._find_better(best, best) or self._exchange(best)
+            at = best if best.names or not best.discrepancy else self._from_better_end(best)
+            better = self._find_better(at, at)
+            if better is None or not self._is_better(better, best):
+                better = self._exchange(best)
             if better is None:
                 break
-            best = better if number else self._from_other_ends(better)
+            best = better
         return best
 
-    def _from_other_ends(self, best: FittedSet) -> FittedSet:
-        """The same set from the other end of how the simulator takes its commands, where that promises more.
+    def _from_better_end(self, nothing: FittedSet) -> FittedSet:
+        """The empty set at that end of how the simulator takes its commands from which candidates promise
+        more.
 
         Commands held in steps are nearly commands in lines that come later, and no small step leads from one
-        to the other; without this a delay takes three times as long.
+        to the other: what passes for a delay there hides what acts.
         """
-        effects = self.composed.effects
-        for name in (n for n in self.along if effects[n].numeric and not effects[n].dear):
-            for short, p in effects[name].parameters.items():
-                if np.isfinite([p.low, p.high]).all():
-                    near_low = best.point[name][short] < 0.5 * (p.low + p.high)
-                    other = {**best.point[name], short: p.high if near_low else p.low}
-                    point = {**best.point, name: other}
-                    composed = best.composed.moved(point)
-                    linear = linearise(composed, point, [*self.along, *best.names], best.linear.starts)
-                    if linear.diverged:
-                        continue
+        ends, columns, promised = [nothing], [], []
+        for name in (n for n in self.along if self.composed.effects[n].numeric):
+            for short, p in self.composed.effects[name].parameters.items():
+                if self.composed.effects[name].dear or p.nominal not in (p.low, p.high):
+                    continue
+                other = p.high if nothing.point[name][short] < 0.5 * (p.low + p.high) else p.low
+                point = {**nothing.point, name: {**nothing.point[name], short: other}}
+                composed = nothing.composed.moved(point)
+                linear = linearise(composed, point, self.along, nothing.linear.starts)
+                if not linear.diverged:
                     cov = covariances(composed, linear)
-                    there = replace(best, composed=composed, point=point, linear=linear, covariances=cov)
-                    sets, levels = self.propose(there, best.names)
-                    score, k, begin = self._likeliest(sets, best.names)
-                    if score > best.score + NEAR:
-                        fitted = self.fit(best.names, begin, [levels[k]], best.score)
-                        if fitted is best:  # lines from here promise what does not come true
-                            return best
-                        best = fitted
-        return best
+                    end = replace(nothing, composed=composed, point=point, linear=linear, covariances=cov)
+                    ends.append(end)
+        for end in ends:
+            self.columns = {}
+            sets, levels, _ = self._columns_at(end, self.wanted)
+            every = [(), *neighbours((), sets.names)]
+            promised.append(max(float(sets.scores(every, k).max()) for k in range(len(levels))))
+            columns.append(self.columns)
+        best = int(np.argmax(promised))
+        self.columns = columns[best]
+        return ends[best]
 
     def _from_calibration(self) -> FittedSet | None:
         """The set of what calibration moved, less what it can do without in closed form."""
@@ -356,9 +367,24 @@ class Search:
         small change. They stay as they were where the search began; the leading ones are rolled out anew.
         """
         composed, held = at.composed, at.names
-        base, more = base_at(composed, at.point), dict[str, Moved]()
+        sets, levels, linear = self._columns_at(at, names)
+        if not held:
+            self.identifiable = identifiability(*sets.product())
+            self.diverged = tuple(n for n in names if n not in linear.moved)
+        base = base_at(composed, at.point)
+        # Where the gap is large, one straight line leads only part of the way; it is largest without causes.
+        for count in LEADERS if held else FIRST_ROLLS * LEADERS[:1]:
+            linear = self._roll_out_leaders(composed, base, linear, sets, levels, held, count)
+            sets = self._sets(linear, levels, names)
+        return sets, levels
+
+    def _columns_at(self, at: FittedSet, names: Sequence[str]) -> tuple[Sets, list[Whitener], Linear]:
+        """Candidates along straight lines about the point of a set: in closed form, its levels of the
+        discrepancy, and the linearised gap."""
+        composed, more = at.composed, dict[str, Moved]()
+        base = base_at(composed, at.point)
         for name in names:
-            if name not in held:
+            if name not in at.names:
                 if name not in self.columns:
                     say(f"what {name} would do")
                     size = np.full(len(composed.effects[name].parameters), USUAL)
@@ -368,21 +394,14 @@ class Search:
         linear = at.linear.with_moved(more)
         scales = [{n: s * k for n, s in at.discrepancy.items()} for k in LEVELS if at.discrepancy]
         levels = [at.covariances.whitener(d, at.wide) for d in (*scales, NONE)]
-        sets = self._sets(linear, levels, names)
-        if not held:
-            self.identifiable = identifiability(*sets.product())
-            self.diverged = tuple(n for n in names if n not in linear.moved)
-        # Where the gap is large, one straight line leads only part of the way; it is largest without causes.
-        for count in LEADERS if held else 2 * LEADERS[:1]:
-            linear = self._roll_out_leaders(composed, base, linear, sets, held, count)
-            sets = self._sets(linear, levels, names)
-        return sets, levels
+        return self._sets(linear, levels, names), levels, linear
 
     def _roll_out_leaders(
-        self, composed: Composed, base: Base, linear: Linear, sets: Sets, held: Names, count: int
-    ) -> Linear:
-        """The leading candidates rolled out where they fit best: what kinks or saturates is a straight line
-        from there only."""
+        self, composed: Composed, base: Base, linear: Linear, sets: Sets, levels: Sequence[Whitener],
+        held: Names, count: int,
+    ) -> Linear:  # fmt: skip
+        """The leading candidates rolled out where they fit best, or on the way there, where that is better
+        than where they were rolled out before: what kinks or saturates is a straight line from there only."""
         effects, first = self.composed.effects, dict[str, dict[str, float]]()
         for level in dict.fromkeys((0, sets.gram.shape[0] - 1)):
             others = [n for n in sets.names if n not in held]
@@ -392,7 +411,7 @@ class Search:
                     names = (*held, name)
                     found = point_of(effects, sets.fit(names, level), names, self.along)
                     first[name] = dict(found[name])
-        more = {}
+        more = dict[str, Moved]()
         for name, at in first.items():
             near = {}
             for (short, p), value in zip(effects[name].parameters.items(), at.values(), strict=True):
@@ -402,9 +421,19 @@ class Search:
                 near = {
                     n: p.nominal + (p.sd if p.nominal + p.sd <= p.high else -p.sd) for n, p in known.items()
                 }
-            one = vary(composed, base, name, near)
-            if one is not None:
-                more[name] = one
+            before = linear.moved[name]
+            away = [abs(near[n] - v) / p.sd for (n, p), v in zip(known.items(), before.at, strict=True)]
+            if max(away) < NOTHING_NEW:
+                continue
+            most, found = _best_level(levels, linear.residual - before.shift), None
+            for _ in range(HALVINGS):
+                there = _best_level(levels, linear.target - rows_at(composed, base, name, near))
+                if found is not None and there <= most:
+                    break
+                most, found = (there, near) if there > most else (most, found)
+                near = {n: 0.5 * (near[n] + float(v)) for n, v in zip(known, before.at, strict=True)}
+            one = None if found is None else vary(composed, base, name, found)
+            more |= {} if one is None else {name: one}
         return linear.with_moved(more)
 
     def _find_better(self, at: FittedSet, best: FittedSet) -> FittedSet | None:
@@ -414,7 +443,8 @@ class Search:
         """
         sets, levels = latest(self._proposed, at, lambda: self.propose(at, self.wanted))
         near = neighbours(at.names, sets.names)
-        near += pairs(at.names, sets.names) if at is best else []  # a replacement is a single effect
+        # A replacement is a single effect, and of a large gap lines promise too little of the first.
+        near += pairs(at.names, sets.names) if at is best and at.names else []
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
         own = max(sets.scores([at.names], level)[0] for level in range(len(levels)))
@@ -441,7 +471,8 @@ class Search:
                 least = max(least, -NEAR - wrong)
             if one.score > found.score and self._is_better(one, best):
                 found = one
-                if at is best and one.score > best.score + NEAR:  # others are better proposed about it
+                # Others are better proposed about it, if what it leaves is not that of a wrong first.
+                if at is best and one.score > best.score + NEAR and (at.names or not one.discrepancy):
                     break
         return None if found is best else found
 
@@ -502,6 +533,12 @@ class Search:
             if there is not None:
                 return there
         return None
+
+
+def _best_level(levels: Sequence[Whitener], residual: np.ndarray) -> float:
+    """Log density of a residual (N,) with the level of the discrepancy that gives the most [nats]."""
+    left = np.nan_to_num(residual)
+    return max(-0.5 * float(np.sum(whiten(left) ** 2)) - whiten.half_log_det for whiten in levels)
 
 
 def _prior_constants(sizes: Sequence[int]) -> float:

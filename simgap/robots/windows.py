@@ -38,10 +38,11 @@ FLIES, RESTS, STRIKES = REGIMES = ("nothing touches", "bodies rest on each other
 class Window:
     """Rows [begin, end) of a log.
 
-    `log`, `begin`, `end`: number of the log and its rows; `forward`: whether the start is smoothed from later
-    samples alone; `start`, `doubt`: its states and their standard deviations; None where the simulator does
-    not restart; `regime`: one of REGIMES, where the simulator reports contacts; `aside`: how far from the
-    start the window is run and linearised, by state.
+    `log`, `begin`, `end`: number of the log and its rows; `lead`: how many rows earlier it is run from, so
+    that what is read late or smoothed shows what went before; `forward`: whether the start is smoothed from
+    later samples alone; `start`, `doubt`: its states and their standard deviations; None where the simulator
+    does not restart; `regime`: one of REGIMES, where the simulator reports contacts; `aside`: how far from
+    the start the window is run and linearised, by state.
     """
 
     log: int
@@ -52,6 +53,12 @@ class Window:
     doubt: dict[str, float]
     regime: str = FLIES
     aside: Mapping[str, float] = field(default_factory=dict)
+    lead: int = 0
+
+    @property
+    def first(self) -> int:
+        """The row from which it is run."""
+        return self.begin - self.lead
 
     def begun(self, read: Mapping[str, tuple[float, float]] | None = None) -> dict[str, float] | None:
         """Where the window is run from; `read`: states that were read anew."""
@@ -89,12 +96,15 @@ def cut(
         marks = [*([] if contacts is None else map(float, contacts(log))), *log.t[turns], *log.t[gaps]]
         edges = _edges(log, marks, length)
         edges[0] = _readable(simulator, log, edges[1])
+        early = max(1, round(REACH / max(float(np.median(step)), 1e-9)))
         for begin, end in itertools.pairwise(edges):
             near = any(abs(float(log.t[begin]) - m) < REACH for m in marks)
             regime = FLIES
             if touching[begin:end].any():
                 regime = RESTS if rests[begin:end].all() else STRIKES
-            window = Window(number, begin, end, near, None, {}, regime)
+            # What rests is run from rest, and what strikes did not a moment earlier.
+            lead = 0 if near or regime == RESTS or begin == edges[0] else min(early, begin - edges[0])
+            window = Window(number, begin, end, near, None, {}, regime, lead=lead)
             out.append(_begun(simulator, log, window, noise, jumped))
     return out
 
@@ -102,9 +112,9 @@ def cut(
 def _begun(
     simulator: Simulator, log: Recording, window: Window, noise: Mapping[str, float], jumped: np.ndarray
 ) -> Window:
-    state = start_of(simulator, log, window.begin, noise, window.forward)
+    state = start_of(simulator, log, window.first, noise, window.forward)
     values, doubt = {n: v for n, (v, _) in state.items()}, {n: s for n, (_, s) in state.items()}
-    if jumped[window.begin : window.end].any():
+    if jumped[window.first : window.end].any():
         doubt[JUMPS] = DOUBT * 12**-0.5  # uniform over the interval
     return replace(window, start=values, doubt=doubt)
 

@@ -654,3 +654,30 @@ def test_efforts_alone_can_be_compared(files):
         mujoco.mj_step(model, data)
         told.append(float(data.actuator_force[0]))
     np.testing.assert_allclose(given, told[::5], atol=1e-6)
+
+
+CART = """<mujoco><option timestep="0.002"/><default><geom contype="0" conaffinity="0"/></default><worldbody>
+<body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping="1" armature="0.1"/>
+<geom type="box" size=".1 .05 .05" mass="0.8"/>
+<body name="pole"><joint name="pivot" axis="0 1 0" damping="0.02"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.5" size=".01" mass="0.2"/></body></body></worldbody>
+<actuator><motor name="belt" joint="rail"/></actuator></mujoco>"""
+
+
+def test_a_wrong_unit_of_a_slide_shows_and_joints_without_a_column_can_be_at_fault(files):
+    model = mujoco.MjModel.from_xml_string(CART)
+    data, rows = mujoco.MjData(model), []
+    for step in range(1500):
+        data.ctrl[0] = 4 * np.sin(0.01 * (step - step % 5))
+        if step % 5 == 0:
+            rows.append([step * 0.002, data.qpos[0], data.ctrl[0]])
+        mujoco.mj_step(model, data)
+    columns = '[columns.u]\nactuator = "belt"\nunit = "N"\n[columns.x]\njoint = "rail"\nunit = '
+    xml, map_file = files(CART, columns + '"mm"\n')
+    log = xml.with_name("log.csv")
+    np.savetxt(log, rows, delimiter=",", header="t,x,u", comments="")
+    refused(r"column x: moves .* expected unit = .m.", load_mjcf(xml, map_file).read, log)
+    map_file.write_text(columns + '"m"\n')
+    loaded = load_mjcf(xml, map_file)
+    loaded.effects([loaded.read(log)])
+    assert {"joint:pivot.frictionloss", "body:pole.mass"} <= {*loaded.simulator.parameters}

@@ -69,6 +69,28 @@ def test_starts_are_right_within_what_they_say_and_of_a_jerk_read_as_such():
     assert abs(np.polyfit(x, values[47:54], 2)[1] - true) > 3 * sd
 
 
+def test_commands_that_were_logged_late_are_found_early():
+    plain = log(0)
+    late = plain.with_columns({"torque": np.append(plain["torque"][0], plain["torque"][:-1])})
+    early = composed([late]).effects["command.early"].command(late, {"early": 0.01})
+    assert early["torque"][:-1] == pytest.approx(plain["torque"][:-1], abs=1e-9)
+
+
+def test_what_is_read_late_at_a_windows_begin_is_what_went_before():
+    plain = log(0, seconds=20.0, noise=0.0)
+    jolts = 0.4 * np.sign(np.random.default_rng(1).standard_normal(200))[(plain.t / 0.1).astype(int)]
+    jolted = plain.with_columns({"torque": jolts})
+    robot = checked(Swing(), "Swing")
+    true = robot.simulate({n: p.nominal for n, p in robot.parameters.items()}, jolted)["angle"]
+    late = delayed(plain.t, true, 0.02) + 5e-4 * np.random.default_rng(2).standard_normal(plain.t.size)
+    model = composed([jolted.with_columns({"angle": late})])
+    point = {"readout:angle.lag": {"delay": 0.02}}
+    linear = linearise(model, point, [])
+    early = linear.rows.time - model.recordings[0].t[[w.begin for w in model.windows]][linear.rows.window]
+    squares = covariances(model, linear).whitener()(linear.residual) ** 2
+    assert squares[early < 0.015].mean() < 1.5
+
+
 def test_whitened_residuals_of_a_true_model_or_of_an_effect_at_its_value_are_white():
     model = composed([log(s) for s in range(4)])
     residual, _, linear = whitened(model)

@@ -444,7 +444,7 @@ def test_in_contact_a_fourth_of_the_step_by_another_integrator_is_the_run_itself
     starts, finer = composed.starts(point), load(0.002, "Euler")
     finer.effects([log])
     for window, start, ours in zip(composed.windows, starts, composed.rolled(point, starts), strict=True):
-        own = finer.simulator.simulate({}, log.window(window.begin, window.end), start)
+        own = finer.simulator.simulate({}, log.window(window.first, window.end), start)
         np.testing.assert_allclose(ours["q"], own["q"], atol=1e-9)
 
 

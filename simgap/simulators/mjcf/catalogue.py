@@ -50,10 +50,10 @@ def offered(
     m, read = simulator.model, simulator.joints.values()
     moving = [j for j in range(m.njnt) if int(m.jnt_type[j]) in (HINGE, SLIDE) and name_of(m, "joint", j)]
     joints = [j for j in moving if j in read]
-    catalogue.add_joints(joints, motions)
+    catalogue.add_joints(moving, motions)
     catalogue.add_ties()
     catalogue.add_actuators()
-    catalogue.add_bodies(joints)
+    catalogue.add_bodies(moving)
     catalogue.add_options()
     catalogue.add_contacts(recordings)
     catalogue.add_named(named)
@@ -110,7 +110,8 @@ class _Catalogue:
                 ("cogging", False, "a torque on {} that comes and goes around the turn"),
                 ("ripple", True, "a motor of {} whose strength comes and goes around the turn"),
             ):
-                often = periods(motions, j, scaled) if int(self.model.jnt_type[j]) == HINGE else 0.0
+                seen = int(self.model.jnt_type[j]) == HINGE and j in self.simulator.joints.values()
+                often = periods(motions, j, scaled) if seen else 0.0
                 if not often:
                     continue
                 says, effect = what.format(name), f"{head}.{law}"

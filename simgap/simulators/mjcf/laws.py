@@ -70,7 +70,7 @@ class Laws:
             j = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, f"{joint}{MOTOR}")
             j = object_id(model, "joint", joint) if j < 0 else j
             place, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
-            share, skew, extra, speed, drag = (own.get(n, 0.0) for n in OF_FRICTION)
+            share, skew, extra, speed, drag = (float(own.get(n, 0.0)) for n in OF_FRICTION)
             if share or skew or extra or drag:
                 friction.append(_Friction(dof, share, skew, extra, max(speed, 1e-9), drag))
             for scaled in (False, True):
@@ -118,7 +118,8 @@ def run(model: Any, data: Any, laws: Laws, first: np.ndarray, control: np.ndarra
                     if half:
                         most += half * abs(motor[d] + bias[d])
                     if extra:
-                        most += extra * exp(-((rate[d] / speed) ** 2))
+                        share = rate[d] / speed
+                        most += extra * exp(-share * share)
                     if skew:
                         most += skew * ((rate[d] > 0) - (rate[d] < 0))
                     limit[d] = most if most > 0 else 0.0

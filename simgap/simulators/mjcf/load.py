@@ -11,13 +11,14 @@ import numpy as np
 
 from hmmseg.errors import InputError, nearest
 from hmmseg.io.units import UNITS, known_unit, unwrapped
+from hmmseg.robust import bridged, white_sd
 from simgap.robot_effects.base import RobotEffect
 from simgap.simulators.mjcf import setting
 from simgap.simulators.mjcf.catalogue import offered
 from simgap.simulators.mjcf.engine import FREE, HINGE, JOINT, SLIDE, mujoco
 from simgap.simulators.mjcf.map import POSE, Map, Mapped
 from simgap.simulators.mjcf.model import MjcfSimulator, ties
-from simgap.simulators.protocol import Channel
+from simgap.simulators.protocol import RATE, Channel, Job
 from simgap.simulators.recording import Recording, held, read_recording
 
 
@@ -52,6 +53,7 @@ class Loaded:
             log = continuous(log, [pose[a] for a in POSE[3:]])
         _check_ranges(self.simulator.model, columns, log, str(path))
         _check_goals(self.simulator, log, str(path))
+        _check_travel(self.simulator, log, str(path))
         warnings += _clipped(self.simulator, log, str(path))
         return replace(log, warnings=tuple(warnings))
 
@@ -287,8 +289,13 @@ def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
     for column, a in simulator.driven.items():
         joint, per = int(model.actuator_trnid[a, 0]), "/s" if setting.follows_rates(model, a) else ""
         servo = int(model.actuator_trntype[a]) == JOINT and (per or model.actuator_biasprm[a, 1] < 0)
-        if not servo or joint not in seen or int(model.jnt_type[joint]) != HINGE:
+        if not servo or joint not in seen:
             continue
+        turning = int(model.jnt_type[joint]) == HINGE
+        factors = (
+            ((math.degrees(1), "deg"), (math.radians(1), "rad")) if turning else ((1e3, "mm"), (1e-3, "m"))
+        )
+        way = f"{'rad' if turning else 'm'}{per}"
         goal, there = log[column], seen[joint]
         angle = np.gradient(log[there], log.t) if per else log[there]
         angle = angle * float(model.actuator_gear[a, 0])
@@ -296,12 +303,49 @@ def _check_goals(simulator: MjcfSimulator, log: Recording, file: str) -> None:
         if not both.any() or not np.any(angle[both]):
             continue
         times = float(goal[both] @ angle[both] / (angle[both] @ angle[both]))
-        for factor, unit in ((math.degrees(1), "deg"), (math.radians(1), "rad")):
+        for factor, unit in factors:
             if abs(math.log(max(times, 1e-9) / factor)) < SAME:
-                ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} rad{per}"
-                shown = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} rad{per} of column {there}"
+                ends = f"{np.nanmin(goal):.4g} to {np.nanmax(goal):.4g} {way}"
+                shown = f"{np.nanmin(angle):.4g} to {np.nanmax(angle):.4g} {way} of column {there}"
                 mend = f'unit = "{unit}{per}" of {column} in the map?'
                 raise InputError(f"{file}: column {column}", f"{ends}, and its joint is at {shown}", mend)
+
+
+PIECE = 0.4  # numerics: s that a model is run under a log's commands to see how far it moves
+TIMES = 100.0  # limit: how many times as far as its log a slide may move in a model
+
+
+def _check_travel(simulator: MjcfSimulator, log: Recording, file: str) -> None:
+    """InputError where a slide without a range moves so much less or more in the log than in the model under
+    its commands that the unit must be another; units are never guessed."""
+    model = simulator.model
+    slides = {c: j for c, j in simulator.joints.items() if int(model.jnt_type[j]) == SLIDE}
+    slides = {c: j for c, j in slides.items() if not model.jnt_limited[j]}
+    size = max(3, round(PIECE / max(float(np.median(np.diff(log.t))), 1e-9)))
+    pieces = [log.window(a, a + size) for a in range(0, len(log) - size, size)]
+    if not slides or not simulator.driven or not pieces:
+        return
+    whole = {n: bridged(log[n]) for n in simulator.states}
+    begun = [{n: float(v[p.first]) for n, v in whole.items()} for p in pieces]
+    jobs = [Job({}, p, {**b, **{n + RATE: 0.0 for n in b}}) for p, b in zip(pieces, begun, strict=True)]
+    runs = [(p, run) for p, run in zip(pieces, simulator.simulate_many(jobs), strict=True) if run is not None]
+    for column, joint in slides.items() if runs else ():
+        seen, made = (
+            np.concatenate([v[column] - v[column][0] for v in each])
+            for each in (
+                [{column: whole[column][p.first : p.first + size]} for p, _ in runs],
+                [r for _, r in runs],
+            )
+        )
+        noise = white_sd(whole[column], 2)
+        far, model_far = (float(np.sqrt(np.mean(v**2))) for v in (seen, made))
+        for less, more, unit in ((far, model_far, "m"), (model_far, far, "mm")):
+            if more > TIMES * less and far > 10 * noise and seen @ made > 0:
+                found = (
+                    f"moves {far:.2g} m in {PIECE:g} s, and joint {setting.name_of(model, 'joint', joint)}"
+                )
+                found = f"{found} of the model {model_far:.2g} m under the same commands"
+                raise InputError(f"{file}: column {column}", found, f'unit = "{unit}" in the map?')
 
 
 SAME = math.log(2.0)  # limit: logarithm of the factor by which a servo may miss its goals

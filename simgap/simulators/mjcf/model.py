@@ -25,6 +25,7 @@ from simgap.simulators.protocol import RATE, Channel, Channels, Job, Values
 from simgap.simulators.recording import Recording
 
 CLOSING, CLOSED = 20, 1e-9  # numerics: most steps that close a loop, and the last of them
+RESTS, STILL = 1.0, 0.02  # numerics: s in which a model comes to rest, and the rates at which it does
 GIVEN = 1000  # numerics: windows for which it is kept how ties have them start, and how far they give
 
 
@@ -121,7 +122,7 @@ class MjcfSimulator:
     def _run(self, log: str, softness: tuple[tuple[str, float], ...]) -> np.ndarray:
         """Full physics states (num_timesteps, size) along a log, as the model runs it freely."""
         recording = self._logs[log]
-        first = self._state(Job({}, recording, None))
+        first = self._rested(self._state(Job({}, recording, None)), recording)
         with changed_model(self.model, self.settings, softness):
             found = free_run(self.model, self._data[0], recording, first, self.driven)
         found[0] = first
@@ -156,6 +157,38 @@ class MjcfSimulator:
             state[q + 3 : q + 7] = quat
             state[v + 3 : v + 6] = body_rate(quat, rate - quat * (quat @ rate))
         return state
+
+    def _rested(self, first: np.ndarray, log: Recording) -> np.ndarray:
+        """The full physics state in which the model comes to rest under a log's first commands, with joints
+        held where columns have them; `first` where it comes to none, or the map says where it starts."""
+        m, data, nq = self.model, self._data[0], self.model.nq
+        if self.map.keyframe is not None:
+            return first
+        mujoco.mj_setState(m, data, first, FULL)
+        for column, actuator in self.driven.items():
+            data.ctrl[actuator] = log[column][0]
+        dofs = [v for _, v in self._places.values()]
+        at = [q for q, _ in self._places.values()]
+        for _ in range(round(RESTS / float(m.opt.timestep))):
+            mujoco.mj_step(m, data)
+            data.qpos[at], data.qvel[dofs] = first[[1 + q for q in at]], 0.0
+        rested = np.empty_like(first)
+        mujoco.mj_getState(m, data, rested, FULL)
+        rested[0] = 0.0
+        still = np.isfinite(rested).all() and np.abs(rested[1 + nq : 1 + nq + m.nv]).max() < STILL
+        return self._tied(rested) if still else first
+
+    def along(self, log: Recording) -> np.ndarray:
+        """Full physics states (num_timesteps, size) along a log: columns where they tell, the rest as the
+        model runs it freely."""
+        if not (self._partial or self._ties):
+            ran = np.tile(self._own_state(log), (len(log), 1))
+        else:
+            self._logs = {**self._logs, log.name: log}
+            ran = self._run(log.name, ())
+        for column, (q, _) in self._places.items():
+            ran[:, 1 + q] = bridged(log[column])
+        return np.array([self._tied(state) for state in ran]) if self._ties and not self._inner.size else ran
 
     def _tied(self, state: np.ndarray) -> np.ndarray:
         """A full physics state with joints that follow others where these have them."""

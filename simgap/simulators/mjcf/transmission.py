@@ -12,7 +12,7 @@ from scipy.signal import savgol_filter
 from simgap.attribution.verdict import ALARM
 from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
-from simgap.simulators.mjcf.engine import mujoco
+from simgap.simulators.mjcf.engine import HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.setting import name_of, object_id
 from simgap.simulators.protocol import Channels
@@ -143,15 +143,20 @@ class Motion:
 
 
 def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
-    """The motion along a log; joints without a column rest where the model has them."""
-    model = simulator.model
+    """The motion along a log; what no column shows moves as the model's own run has it, ties and loops
+    closed."""
+    model, states = simulator.model, simulator.along(log)
+    nq, seen = model.nq, {joint: log[column] for column, joint in simulator.joints.items()}
+    for joint in np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist():
+        seen.setdefault(joint, states[:, 1 + int(model.jnt_qposadr[joint])])
     position, rate, acceleration = {}, {}, {}
-    for column, joint in simulator.joints.items():
-        position[joint], rate[joint], acceleration[joint] = smoothed(log.t, log[column])
+    for joint, values in seen.items():
+        position[joint], rate[joint], acceleration[joint] = smoothed(log.t, values)
     data = mujoco.MjData(model)
     torque, motor = ({j: np.zeros(len(log)) for j in position} for _ in range(2))
     rows = np.arange(0, len(log), max(1, round(len(log) / max(float(log.t[-1] - log.t[0]) * 100.0, 1.0))))
     for i in rows:
+        data.qpos[:], data.qvel[:] = np.split(states[i, 1 : 1 + nq + model.nv], [nq])
         for j in position:
             q, v = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
             data.qpos[q], data.qvel[v], data.qacc[v] = position[j][i], rate[j][i], acceleration[j][i]
