@@ -443,9 +443,9 @@ class Search:
         """
         sets, levels = latest(self._proposed, at, lambda: self.propose(at, self.wanted))
         near = neighbours(at.names, sets.names)
-        # A replacement is a single effect, and of a large gap lines promise too little of the first.
-        near += pairs(at.names, sets.names) if at is best and at.names else []
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
+        singles = len(near)
+        near += pairs(at.names, sets.names) if at is best or not at.names else []  # a replacement is single
         score = np.stack([sets.scores(near, level) for level in range(len(levels))])
         own = max(sets.scores([at.names], level)[0] for level in range(len(levels)))
         level = [int(k) for k in score.argmax(0)]
@@ -454,26 +454,31 @@ class Search:
         if at is not best:  # straight lines miss as much of a replacement as they miss of the best itself
             of_best = score.max(0)[[{*names} == {*best.names} for names in near]]
             least = min(0.0, *(of_best - own + at.score - best.score)) - NEAR
-        tried, wrong, found = 0, 0.0, best
-        for k in np.argsort(-promised):
-            # Two replacements are fitted to the end whatever straight lines promise: these may miss by more.
-            learns = at is not best and tried < LEARNED
-            if tried >= TRIED or (promised[k] < least and not learns):
-                break
-            names = near[k]
-            begin = point_of(self.composed.effects, sets.fit(names, level[k]), names, self.along)
-            if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
-                continue
-            scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
-            one, tried = self.fit(names, begin, scales, -np.inf if learns else best.score), tried + 1
-            wrong = max(wrong, one.score - best.score - promised[k])
-            if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
-                least = max(least, -NEAR - wrong)
-            if one.score > found.score and self._is_better(one, best):
-                found = one
-                # Others are better proposed about it, if what it leaves is not that of a wrong first.
-                if at is best and one.score > best.score + NEAR and (at.names or not one.discrepancy):
+        found, order = best, np.argsort(-promised)
+        # Of a large gap lines promise too little of one effect and too much of two: one alone is tried first.
+        for part in (order,) if at.names else (order[order < singles], order[order >= singles]):
+            if found is not best:
+                least = found.score - best.score + NEAR
+            tried, wrong = 0, 0.0
+            for k in part:
+                # Two replacements are fitted to the end whatever lines promise: these may miss by more.
+                learns = at is not best and tried < LEARNED
+                if tried >= TRIED or (promised[k] < least and not learns):
                     break
+                names = near[k]
+                begin = point_of(self.composed.effects, sets.fit(names, level[k]), names, self.along)
+                if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
+                    continue
+                scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
+                one, tried = self.fit(names, begin, scales, -np.inf if learns else best.score), tried + 1
+                wrong = max(wrong, one.score - best.score - promised[k])
+                if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
+                    least = max(least, -NEAR - wrong)
+                if one.score > found.score and self._is_better(one, best):
+                    found = one
+                    # Others are better proposed about it, if what it leaves is not that of a wrong first.
+                    if at is best and one.score > best.score + NEAR and (at.names or not one.discrepancy):
+                        break
         return None if found is best else found
 
     def predicts_better(self, one: FittedSet, other: FittedSet, by: FittedSet) -> bool:

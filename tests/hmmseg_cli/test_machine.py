@@ -528,3 +528,11 @@ def test_documents_are_strict_json_and_trials_distinct(tmp_path):
         refused(r"csv: the same trial as .*a\.csv; expected every trial once", distinct_trials, twice)
     refused(r"absent\.csv: no such file; expected a trial", distinct_trials, [tmp_path / "absent.csv"])
     refused("is a folder; expected a trial", distinct_trials, [tmp_path])
+
+
+def test_a_report_of_a_fault_names_what_is_installed(capsys):
+    assert main(["doctor", "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["format"] == "hmmseg.doctor/1" and found["packages"]["numpy"] == np.__version__
+    assert found["packages"].keys() >= {"mujoco", "h5py"} and "hmmseg" not in found["packages"]
+    assert sys.executable in found["python"] and found["hmmseg"].startswith(hmmseg.__version__)
