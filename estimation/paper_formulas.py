@@ -24,7 +24,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, UNITS, Subtask, decompo
 from hmmseg.hand.signals import Signals
 from hmmseg.io.task import BlockTask
 from hmmseg.segmentation.spans import Segmentation
-from hmmseg.segmentation.thresholds import label_states
+from hmmseg.segmentation.thresholds import StateLabels, label_states
 
 TRIM = 0.05  # cited: share of the carry omitted at either end in the paper's weight estimate
 
@@ -61,14 +61,16 @@ class _Trial:
 
 
 def estimate_plugin(
-    trials_signals: Sequence[Signals], segmentations: Sequence[Segmentation], task: BlockTask
-) -> tuple[Properties, dict[str, str]]:
+    trials_signals: Sequence[Signals], segmentations: Sequence[Segmentation], task: BlockTask,
+    states: Sequence[StateLabels] | None = None,
+) -> tuple[Properties, dict[str, str]]:  # fmt: skip
     """The paper's estimates of every object of a task from its segmented trials.
 
     Args:
         trials_signals: one per trial.
         segmentations: one per trial.
         task: of all trials.
+        states: contact states of each trial's samples; by default those of the paper's thresholds.
 
     Returns:
         Every property's entry in identify's JSON, with its `standard_error` and normal intervals; and the
@@ -77,11 +79,12 @@ def estimate_plugin(
     Raises:
         ValueError: the sequences differ in length.
     """
+    labels = [label_states(s) for s in trials_signals] if states is None else states
     task = _as_performed(task, segmentations)
     steps = subtasks(task)
     trials = [
-        _Trial(signals, label_states(signals).state > 1, _matched(segmentation, steps))
-        for signals, segmentation in zip(trials_signals, segmentations, strict=True)
+        _Trial(signals, label.state > 1, _matched(segmentation, steps))
+        for signals, segmentation, label in zip(trials_signals, segmentations, labels, strict=True)
     ]
     heights, described = _heights(trials, task, steps), decompose(task).properties
     properties: Properties = {}
