@@ -184,13 +184,13 @@ class Search:
         return found
 
     def _without(self, found: FittedSet, out: str) -> FittedSet:
-        """A set less one effect, fitted from the set's own point unless that promises no more than is known:
-        the solver's numbers have optima of their own, and sets are compared at the same."""
+        """A set less one effect, fitted from the set's own point and starts unless that promises no more than
+        is known: the solver's numbers have optima of their own, and sets are compared at the same."""
         rest = found.less(out)
         known = self.fitted.get(frozenset(rest))
         if known is not None and found.promises(rest) <= known.score + BETTER:
             return known
-        return self.fit(rest, without(found.point, out), [found.whiten])
+        return self.fit(rest, without(found.point, out), [found.whiten], near=found)
 
     def nothing(self) -> FittedSet:
         """The empty set: only what is fitted along."""
@@ -211,6 +211,13 @@ class Search:
                 better = self._exchange(best)
             if better is None:
                 break
+            if not best.names:  # the solver's numbers have optima of their own: compare at the same
+                point = {n: better.point[n] for n in self.along}
+                anew = self.fit((), point, [better.whiten], near=better)
+                if not self._is_better(better, anew):
+                    best = anew
+                    self.columns.clear()
+                    continue
             best = better
         return best
 
@@ -270,8 +277,9 @@ class Search:
         return score, level, point_of(self.composed.effects, sets.fit(names, level), names, self.along)
 
     def fit(
-        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf
-    ) -> FittedSet:
+        self, names: Names, begin: Point, scales: Sequence[Whitener], rival: float = -np.inf,
+        near: FittedSet | None = None,
+    ) -> FittedSet:  # fmt: skip
         """Fit a set exactly, and remember it at its best.
 
         Args:
@@ -281,16 +289,19 @@ class Search:
                 from where it puts the starts, as long as the closed form promises more, or is wrong along the
                 starts of a leading set. A fit that stays behind the rival is begun anew with the next scale.
             rival: Log evidence [nats] of the set to beat.
+            near: Another set, at whose starts windows are run in the first fit.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
-        here, best, key = self.composed.moved(begin), None, frozenset(names)
+        best, key, starts = None, frozenset(names), {} if near is None else near.linear.starts
+        here = (self.composed if near is None else near.composed).moved(begin)
         for whiten in scales:
-            one = self._judge(here, names, self._fit_point(here, begin, whiten))
+            one = self._judge(here, names, self._fit_point(here, begin, whiten, starts))
             for _ in range(AGAIN):
                 leading = max((one, *self.fitted.values()), key=lambda known: known.score)
                 before, (there, linear, bend) = one.score, self._begun_anew(one, leading)
                 bent = bend > BETTER and before + bend > leading.score - NEAR_BY
-                if not bent and one.promise < max(before + BETTER, rival - NEAR):
+                # Sets differ by BETTER, so each is fitted to half of that.
+                if not bent and one.promise < max(before + 0.5 * BETTER, rival - NEAR):
                     break
                 again = self._judge(there, names, fit_effects(there, linear, one.whiten, one.point))
                 one = max((one, again), key=lambda fitted: fitted.score)
@@ -322,8 +333,10 @@ class Search:
         off = judge(np.nan_to_num(anew.residual - linear.residual))
         return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
 
-    def _fit_point(self, composed: Composed, begin: Point, whiten: Whitener) -> Point:
-        return fit_effects(composed, linearise(composed, begin, [], {}), whiten, begin)
+    def _fit_point(
+        self, composed: Composed, begin: Point, whiten: Whitener, starts: Mapping[str, np.ndarray]
+    ) -> Point:
+        return fit_effects(composed, linearise(composed, begin, [], starts), whiten, begin)
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).
