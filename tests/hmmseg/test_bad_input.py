@@ -38,7 +38,8 @@ from simgap.world.properties import read_properties
 TASK = parse_task({"objects": {"a": {"on": "ground"}}, "moves": [{"object": "a", "to": "ground"}]})
 READERS = {"trial": lambda path: read_trial(path, parse_rig({})),
            "model": lambda path: load_model(path, parse_task({"sequence": ["a", "b"]})), "rig": read_rig,
-           "task": read_task}  # fmt: skip
+           "task": read_task, "operator": read_operator,
+           "properties": lambda path: read_properties(path, TASK)}  # fmt: skip
 STACK = Path(__file__).parents[1] / "data/stack"
 MOVES = (example_folder() / "task.toml").read_text(encoding="utf-8")
 SOME = settings(max_examples=int(os.environ.get("HMMSEG_EXAMPLES", "60")), deadline=None,
@@ -147,6 +148,17 @@ def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, capsys):
         half, lines = "half.csv" in command, capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1 + half and ("not show the whole task" in lines[-1]) == half, lines
         assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(("read", "content"), [
+    *(("operator", text) for text in ("[1]", "3", "[" * 100_000, '{"pace": []}', '{"pace": {"a": 1}}')),
+    *(("properties", text) for text in ("[1]", "{}", '{"properties": 3}', "[" * 100_000)),
+    ("properties", '{"properties": {"a": []}}'),
+], ids=lambda value: value[:20])  # fmt: skip
+def test_documents_that_are_none(read, content, tmp_path):
+    path = tmp_path / "made.json"
+    path.write_text(content)
+    assert str(path) in refused("", READERS[read], path)
 
 
 @pytest.mark.parametrize("read", ["trial", "model"])

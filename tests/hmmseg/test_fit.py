@@ -104,6 +104,18 @@ def test_the_start_of_a_trial_gaps_other_rates_and_missing_samples_do_not_matter
     np.testing.assert_allclose(found(result), boundaries, atol=0.08)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_intervals_cover_planted_boundaries(correlation):
+    hits = []
+    for group in range(6):
+        data = [record(1000 + 10 * group + i, correlation=correlation) for i in range(5)]
+        for result, (_, boundaries) in zip(segment_sequence([t for t, _ in data], TASK), data, strict=True):
+            hits += [low <= b <= high for (low, high), b in zip([s.start_90 for s in result.spans[1:]],
+                                                                boundaries, strict=True)]  # fmt: skip
+    assert np.mean(hits) >= 0.85, np.mean(hits)
+
+
 def test_optional_subtasks_may_be_absent():
     task = SequenceTask(TASK.sequence, optional=("turn",))
     kinds = [TASK.sequence, ("wait", "push", "pull"), TASK.sequence, TASK.sequence]
