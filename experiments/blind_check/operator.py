@@ -288,7 +288,7 @@ def _rolled(k: Knots, t: np.ndarray, size: float, rng: np.random.Generator) -> n
         rise = np.clip((t - begin - 0.5) / 0.3, 0, 1) * np.clip((end - 0.5 - t) / 0.3, 0, 1)
         weight = np.maximum(weight, rise)
     out *= weight
-    there = weight > 0.5
+    there = weight > 0  # about from lift to landing: rms over the carries, as the contract has it
     return size * out / np.sqrt(np.mean(out[there] ** 2)) if there.any() else 0 * out
 
 

@@ -253,32 +253,44 @@ def _scatter_hand_roll(given: Any, residual: np.ndarray) -> Any:
     """Variance from roll, which shows only in the fingers' height difference, slowly: width times angle.
 
     Its power lies in the first cosines of each carry, evenly up to SLOW. A hand rolls in all carries;
-    rotation in only some of them is not a roll of the hand.
+    rotation in only some of them is not a roll of the hand. The level of a grip and the nuisances are as
+    slow, so each size is judged by its likelihood beside them, in the residuals of the whole grip.
     """
-    from scipy.fft import dct
+    from simgap.gap.assemble import on_grid
+    from simgap.gap.nuisances import shifted_by
 
-    from simgap.gap.assemble import on_grid, rows_of
-
-    rows, arrays, there = rows_of(given), given.frame.arrays, given.there
+    arrays, there, time = given.frame.arrays, given.there, given.frame.world.t
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])
-    lever = rolled_offset(width * arrays.phase[..., Phase.CARRY], 1.0)[..., None] * given.weight
-    lever[..., [c for c, name in enumerate(CHANNELS) if name != "offset"]] = 0.0
-    lever = lever[there]
-    unit, square = np.zeros(lever.size), np.zeros(lever.size)
-    mine = np.flatnonzero(lever > 0)
-    for cell in np.unique(rows.cell[mine]):
-        at = mine[rows.cell[mine] == cell]
+    lever = rolled_offset(width, 1.0) * arrays.phase[..., Phase.CARRY]
+    here, grips, waves = CHANNELS.index("offset"), [], np.zeros((0, *lever.shape))
+    for t, m in np.ndindex(len(time), arrays.onehot.shape[2]):
+        held = arrays.onehot[t, :, m]
+        at = np.flatnonzero(held * lever[t])
         if at.size < 4:
             continue
-        step = float(np.median(np.diff(rows.time[at])))
-        slow = np.arange(at.size) / (2 * at.size * step) < SLOW
-        unit[at] = slow * np.mean(lever[at] ** 2) * at.size / slow.sum()
-        square[at] = np.asarray(dct(residual[at], norm="ortho")) ** 2
-    if not (unit > 0).any():
+        count = int(np.ceil(2 * SLOW * (time[t, at[-1]] - time[t, at[0]])))
+        waves = np.concatenate([waves, np.zeros((max(count - len(waves), 0), *lever.shape))])
+        angle = np.cos(np.pi * np.outer(np.arange(count), np.arange(at.size) + 0.5) / at.size)
+        waves[:count, t, at] = lever[t, at] * angle * np.sqrt((2 - (np.arange(count) == 0)) / count)[:, None]
+        rows = np.zeros(there.shape, bool)
+        rows[t, :, here] = held > 0
+        grips.append((count, rows[there]))
+    if not grips:
         return None
-    found = on_grid("hand_roll", square, given.nuisances.kept(rows, unit), ROLLS, rows.cell, VARIED)
+    of_roll, nats = np.hstack([shifted_by(given, {"offset": wave}) for wave in waves]), []
+    for count, rows in grips:
+        roll, other, z = of_roll[rows, :count], given.nuisances.columns[rows], residual[rows]
+        turn = np.linalg.qr(np.column_stack([roll, other[:, other.any(0)]]))[0].T
+        roll, other, z = turn @ roll, turn @ other, turn @ z
+        still = np.eye(z.size) + other @ other.T
+        of = [still + size**2 * roll @ roll.T for size in (0.0, *ROLLS)]
+        cost = np.array([z @ np.linalg.solve(s, z) + np.linalg.slogdet(s)[1] for s in of]) / 2
+        nats.append(cost[0] - cost[1:])
+    found = on_grid("hand_roll", np.stack(nats, 1), np.zeros(residual.size), ROLLS, VARIED)
     # Size and speed are unknown in each carry: its slow coefficients have their own variance.
-    return replace(found, variance=np.zeros_like(unit), known=0.0, frees=np.square(ROLLS[-1] * lever))
+    frees = np.zeros(there.shape)
+    frees[..., here] = np.square(ROLLS[-1] * lever * given.weight[..., here])
+    return replace(found, known=0.0, frees=frees[there])
 
 
 def _apply_hand_roll(performance: Performance, values: Values, rng: np.random.Generator) -> Performance:

@@ -93,20 +93,23 @@ CABLE_FORCE = loading(
 )
 
 
-# A short pulse of vertical force when a block touches down: a raised cosine of unit area [1/s].
+# A short pulse of vertical force when a block touches down: a raised cosine of unit area [1/s] and unknown
+# length. One shorter than a sample would be known only by its impulse, so the length is bounded from below.
 
-LENGTH = 0.06  # numerics: s; a pulse shorter than a sample is known only by its impulse
+# prior: from hard feet to soft ones
+TOUCHDOWN = Parameter(0.06, 0.5, "s", low=0.03, high=0.2, log=True, hidden=True)
 
 
 def _impact(m: Motion, values: Values) -> Array:
-    since = m.since[..., 2::4]
-    inside = (since >= 0) & (since < LENGTH)
-    pulse = np.where(inside, (1 - np.cos(2 * np.pi * since / LENGTH)) / LENGTH, 0.0).sum(-1)
+    since, length = m.since[..., 2::4], values["length"]
+    inside = (since >= 0) & (since < length)
+    pulse = np.where(inside, (1 - np.cos(2 * np.pi * since / length)) / length, 0.0).sum(-1)
     return -values["impulse"] * pulse[..., None] * np.array([0.0, 0.5, 0.0, 0.5])
 
 
 CONTACT_IMPACT = loading(
     _impact,
+    given=lambda v: {"length": TOUCHDOWN.nominal} | v,
     name="contact_impact",
     acts_on="dynamics",
     says="a pulse of -impulse in net fy at touchdown",
@@ -114,7 +117,7 @@ CONTACT_IMPACT = loading(
     mistaken_for=("structural_vibration",),
     called="shocks as blocks touch down",
     check="Set down more slowly, and see whether the gap is gone.",
-    parameters={"impulse": Parameter(0.0, 0.03, "N s", low=0.0)},
+    parameters={"impulse": Parameter(0.0, 0.03, "N s", low=0.0), "length": TOUCHDOWN},
     stage=CONTACT,
     wrist=True,
 )

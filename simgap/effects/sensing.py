@@ -276,9 +276,13 @@ def _scatter_clock_jitter(given: Any, residual: np.ndarray) -> Any:
     from simgap.gap.assemble import on_grid, rows_of
 
     rows, rate = rows_of(given), _clock_rates(given)[given.there]
-    size = np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1)
-    part = rows.trial * len(rows.parts) + rows.part
-    return on_grid("clock_jitter", residual**2, size[rows.cell], JITTERS, part, alike=ALIKE)
+    unit = (np.bincount(rows.cell, rate**2) / np.maximum(np.bincount(rows.cell), 1))[rows.cell]
+    mine, square = unit > 0, np.square(given.nuisances.left(residual))
+    variance = 1 + np.square(JITTERS)[:, None] * unit[mine]
+    each = (square[mine] * (1 - 1 / variance) - np.log(variance)) / (2 * ALIKE)
+    _, part = np.unique((rows.trial * len(rows.parts) + rows.part)[mine], return_inverse=True)
+    nats = np.stack([np.bincount(part, one) for one in each])
+    return on_grid("clock_jitter", nats, unit, JITTERS)
 
 
 def _clock_rates(given: Any) -> np.ndarray:

@@ -59,9 +59,8 @@ class Scatter:
 
 
 def on_grid(
-    effect: str, square: np.ndarray, unit: np.ndarray, grid: np.ndarray, part: np.ndarray | None = None,
-    spread: float = 0.0, alike: float = 1.0,
-) -> Scatter:  # fmt: skip
+    effect: str, nats: np.ndarray, unit: np.ndarray, grid: np.ndarray, spread: float = 0.0
+) -> Scatter:
     """The most likely size of a random effect whose variance is size^2 `unit`.
 
     An imitation has a size at the end of the grid, or different sizes in the parts by a Bayes factor of
@@ -69,36 +68,29 @@ def on_grid(
 
     Args:
         effect: Its name.
-        square: Squared residuals (n,).
+        nats: Log likelihood (S, P) of each part's residuals at each size, minus that without the effect; a
+            single cause has the same size in all parts.
         unit: Variance (n,) at size 1.
-        grid: Sizes.
-        part: Part (n,) of each residual; a single cause has the same size in all parts.
+        grid: Sizes (S,).
         spread: Standard deviation of the log size between parts.
-        alike: Number of residuals for each independent disturbance.
     """
-    mine = np.flatnonzero(unit > 0)
-    variance = 1 + grid[:, None] ** 2 * unit[mine]
-    nats = 0.5 / alike * (square[mine] * (1 - 1 / variance) - np.log(variance))
     score = nats.sum(1)
     best, weight = int(score.argmax()), np.exp(score - score.max())
     centre = np.average(np.log(grid), weights=weight)
     sd = max(float(np.sqrt(np.average((np.log(grid) - centre) ** 2, weights=weight))), 1e-3)
     known = float(np.log(np.mean(weight)))  # cost of the unknown size: uniform over the grid
-    same = best < grid.size - 1
-    if part is not None:
-        each = np.stack([np.bincount(part[mine], row) for row in nats])
-        several = (np.logaddexp.reduce(each, axis=0) - np.log(grid.size)).sum()
-        if spread > 0:
-            near = norm.logpdf(np.log(grid), np.log(grid)[:, None], spread)
-            near -= np.logaddexp.reduce(near, axis=1, keepdims=True)
-            each = np.logaddexp.reduce(near[:, :, None] + each, axis=1)
-        one = np.logaddexp.reduce(each.sum(1)) - np.log(grid.size)
-        same = same and bool(one > several - POSITIVE)
+    several = (np.logaddexp.reduce(nats, axis=0) - np.log(grid.size)).sum()
+    if spread > 0:
+        near = norm.logpdf(np.log(grid), np.log(grid)[:, None], spread)
+        near -= np.logaddexp.reduce(near, axis=1, keepdims=True)
+        nats = np.logaddexp.reduce(near[:, :, None] + nats, axis=1)
+    one = np.logaddexp.reduce(nats.sum(1)) - np.log(grid.size)
+    same = best < grid.size - 1 and bool(one > several - POSITIVE)
     return Scatter(effect, float(grid[best]), sd, grid[best] ** 2 * unit, known, same)
 
 
 def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Scatter]:
-    """The scatter of each of the named effects in residuals (n,), if there is any."""
+    """The scatter of each of the named effects in residuals (n,), nuisances included, if there is any."""
     scattering: list[Callable[..., Scatter | None]] = [
         e.scatter for n, e in catalogue().items() if n in names and e.scatter is not None
     ]

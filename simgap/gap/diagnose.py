@@ -398,10 +398,7 @@ def attributed(
         searched = f, sought(f)
         joint = _leading(found, f, searched[1][0])
         if joint is not None:
-            left = scatters(
-                found.problem, found.problem.nuisances.left(joint.residual),
-                [s.effect for s in found.scatters],
-            )  # fmt: skip
+            left = scatters(found.problem, joint.residual, [s.effect for s in found.scatters])
             gap, searched = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, healthy, forced, seed, searched=searched, absorbed=absorbed)

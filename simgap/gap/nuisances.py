@@ -112,13 +112,13 @@ def _settling(given: Problem) -> list[np.ndarray]:
         for m in range(arrays.onehot.shape[2]):
             mine = np.zeros_like(width)
             mine[t] = arrays.onehot[t, :, m]
-            out.append(_column(given, {"offset": width * SWING * mine * arrays.phase[..., Phase.CARRY]}))
+            out.append(shifted_by(given, {"offset": width * SWING * mine * arrays.phase[..., Phase.CARRY]}))
             for name, share in (("y", 0.5**0.5), ("offset", 2**0.5)):
-                out.append(_column(given, {name: share * LANDING * mine * arrays.phase[..., Phase.PLACE]}))
+                out.append(shifted_by(given, {name: share * LANDING * mine * arrays.phase[..., Phase.PLACE]}))
     return out
 
 
-def _column(given: Problem, shifts: dict[str, np.ndarray]) -> np.ndarray:
+def shifted_by(given: Problem, shifts: dict[str, np.ndarray]) -> np.ndarray:
     """Whitened column (n, 1) of shifts (T, N) of x, y, distance or offset."""
     world, off = given.frame.world, np.zeros((*given.frame.world.t.shape, 4))
     for name, shift in shifts.items():

@@ -12,7 +12,6 @@ import numpy as np
 from estimation.priors import PROPERTY_LOG_SD, PROPERTY_MEDIAN
 from estimation.report import Actual
 from hmmseg.contact.decompose import PROPERTIES
-from simgap.attribution.problem import Rows, cosines
 from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.effects import catalogue, free_parameters, name_of
@@ -47,14 +46,6 @@ class Nuisances:
         """The residual (n,) minus the likeliest nuisances."""
         basis, taken = self._basis
         return residual - basis @ (taken * (basis.T @ residual))
-
-    def kept(self, rows: Rows, variance: np.ndarray) -> np.ndarray:
-        """Variances (n,) of independent cosine coefficients after the likeliest nuisances are subtracted."""
-        mine, (basis, taken) = np.flatnonzero(variance > 0), self._basis
-        few = cosines(rows, basis)[0][mine]
-        out = np.zeros(variance.size)
-        out[mine] = np.square(np.eye(mine.size) - (few * taken) @ few.T) @ variance[mine]
-        return out
 
 
 # prior: error of measured weight (relative), width and height [m] in addition to the stated sd

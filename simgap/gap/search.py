@@ -241,7 +241,7 @@ def search(
     healthy = fit(given, (), neutral(given))
     fits = [best_fit(given, key, healthy) for key in keys]
     others = redrawn(given)
-    scattering = scatters(given, given.nuisances.left(healthy.residual), names)
+    scattering = scatters(given, healthy.residual, names)
     gap = gap_of(given, healthy, fits, scattering, others)
     warnings = [not_compared(trials)] if of_wrist(trials) else []
     failures = [(one.trial.name, one.segmentation.failed) for one in every.trials]

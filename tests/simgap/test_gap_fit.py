@@ -17,17 +17,17 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig
 from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms
-from simgap.attribution.problem import cosines
 from simgap.effects import effect_named
 from simgap.gap import diagnose
-from simgap.gap.assemble import gap_of, rows_of, scatters, together
+from simgap.gap.assemble import gap_of, scatters, together
 from simgap.gap.frame import CHANNELS, build, shown, shown_forms
-from simgap.gap.nuisances import with_nuisances
+from simgap.gap.nuisances import shifted_by, with_nuisances
 from simgap.gap.problem import derivatives, fit, neutral, problem, slots
 from simgap.gap.search import Search, candidate_names, search
 from simgap.gap.simulated import performed
 from simgap.gap.simulated import recorded as read_out
 from simgap.patch import checked, files, replayed
+from simgap.phases import Phase
 from simgap.world.properties import PAPER_BLOCKS, Block
 from simgap.world.replay import replay
 from simgap.world.simulate import simulate_trials
@@ -112,17 +112,19 @@ def test_the_better_of_two_joint_fits_counts(healthy, monkeypatch):
     assert np.abs(starts[1][own]).max() < 0.05  # a healthy hand's
 
 
-def test_a_scatter_is_as_large_as_it_was_before_nuisances_took_of_it(healthy):
-    given = with_nuisances(healthy[0])
-    rows, rng = rows_of(given), np.random.default_rng(0)
-    variance = np.where(rows.channel == CHANNELS.index("offset"), 9.0, 0.0)
-    columns = cosines(rows, given.nuisances.columns)[0]
-    drawn = np.sqrt(variance)[:, None] * rng.standard_normal((variance.size, 400))
-    left = drawn - columns @ np.linalg.solve(np.eye(columns.shape[1]) + columns.T @ columns,
-                                             columns.T @ drawn)  # fmt: skip
-    mine, kept = variance > 0, given.nuisances.kept(rows, variance)
-    assert kept[mine].sum() == pytest.approx(np.square(left[mine]).mean(1).sum(), rel=0.02)
-    assert kept[mine].min() < 0.9 * 9.0 and (kept[~mine] == 0).all()
+def test_a_roll_is_as_large_as_it_was_beside_what_else_tilts_a_block(healthy):
+    """Slow roll has most of its power where grips have their level and nuisances their tilt."""
+    given, arrays, rng = with_nuisances(healthy[0]), healthy[0].frame.arrays, np.random.default_rng(0)
+    width, time = given.centre[:, 1].mean(), given.frame.world.t
+    angle = sum(rng.normal() * np.sin(2 * np.pi * f * time + rng.uniform(0, 7)) for f in (0.2, 0.5, 0.8, 1.1))
+    carry = arrays.phase[..., Phase.CARRY]
+    angle *= 0.012 / np.sqrt((carry * angle**2).sum() / carry.sum())
+    tilted = given.nuisances.columns @ rng.standard_normal(given.nuisances.columns.shape[1])
+    still = rng.standard_normal(given.size) + tilted
+    rolled = still + shifted_by(given, {"offset": width * angle * carry})[:, 0]
+    found, none = (effect_named("hand_roll").scatter(given, one) for one in (rolled, still))
+    assert abs(np.log(found.value / 0.012)) < 2.5 * found.log_sd and found.log_sd < 0.2
+    assert none.value < 0.002
 
 
 @pytest.mark.parametrize("broken", [1, 2])
