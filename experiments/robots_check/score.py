@@ -53,16 +53,19 @@ def held_back(one: Mapping[str, Any]) -> bool:
 
 
 def covered(one: Mapping[str, Any]) -> list[bool]:
-    """Whether intervals contain the sizes of rightly named faults, where the cause has that parameter."""
-    out = []
+    """Whether intervals contain the sizes of rightly named faults, where the cause has that parameter.
+
+    A cause that accounts for two of them, as a delay for that of commands and that of readings, has their
+    sum.
+    """
+    out, effects, named = [], one["found"]["effects"], one["found"]["causes"]
     same = {"delay": "delay", "read_gain": "gain", "read_bias": "bias", "read_lag": "delay", "gain": "gain"}
-    effects = one["found"]["effects"]
-    for fault in one["faults"]:
-        for name in fault["right"]:
-            if fault["kind"] in same and name in one["found"]["causes"] and name in effects:
-                known = effects[name]["parameters"].get(same[fault["kind"]])
-                if known is not None:
-                    out.append(known["interval_90"][0] <= fault["size"] <= known["interval_90"][1])
+    accounts = [next((name for name in f["right"] if name in named), None) for f in one["faults"]]
+    for name in dict.fromkeys(a for a in accounts if a in effects):
+        mine = [f for f, by in zip(one["faults"], accounts, strict=True) if by == name]
+        known = effects[name]["parameters"].get(same.get(mine[0]["kind"]))
+        if known is not None:
+            out.append(known["interval_90"][0] <= sum(f["size"] for f in mine) <= known["interval_90"][1])
     return out
 
 

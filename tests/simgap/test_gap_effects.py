@@ -43,7 +43,8 @@ PLANTED = {"force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
            "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
            "force_gain": {"gain": 0.08}, "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
            "sensor_rotation": {"angle1": 0.05, "angle2": -0.04}, "viscous_drag": {"coefficient": 0.7},
-           "fingertip_mass": {"mass": 0.012}, "contact_impact": {"impulse": 0.02, "length": 0.06}}  # fmt: skip
+           "fingertip_mass": {"mass": 0.012},
+           "contact_impact": {"impulse": 0.02, "length": 0.06}}  # fmt: skip
 
 KINEMATIC = {"joint_offset": {"q11": 0.01, "q12": -0.005, "q21": 0.0, "q22": 0.02},
              "link_length": {"scale": 0.02}}  # fmt: skip
