@@ -28,22 +28,28 @@ from simgap.effects.base import (
     with_mode,
 )
 
-# Pads that are stiffer or softer than nominal.
+# Pads that are stiffer or softer than nominal: by direction, on each finger, or, being of another rubber,
+# alike in all. The last cannot be told from a common gain of the force sensors where weights are unknown.
 
+# prior: Shore hardness is stated to within 5 points, about a fifth of the modulus (ISO 48-4; Gent 1958)
+SOFTNESS = Parameter(0.0, 0.2, low=-0.6, high=2.0)
 FINGERS = ("give_normal1", "give_normal2", "give_shear1", "give_shear2")
 
 
 def _correct_fingertip_compliance(world: World, values: Values, on: Array) -> World:
     each = np.array([values[n] for n in FINGERS])
     return world._replace(
-        give_normal=world.give_normal + values["give_normal"] + each[:2],
-        give_shear=world.give_shear + values["give_shear"] + each[2:],
+        give_normal=world.give_normal * (1 + values["softness"]) + values["give_normal"] + each[:2],
+        give_shear=world.give_shear * (1 + values["softness"]) + values["give_shear"] + each[2:],
     )
 
 
 def _report_fingertip_compliance(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
     """True stiffnesses [N/m] from the additional compliances; a compliance is at least 1e-6 m/N."""
     tip, out = rig.fingertip, {}
+    if "softness" in draws:
+        nominal = {"give_normal": tip.normal_stiffness, "give_shear": tip.shear_stiffness}
+        draws = {name: draws["softness"] / stiffness for name, stiffness in nominal.items()}
     for name, give in draws.items():
         kind, finger = name[5:].rstrip("12"), name[-1] if name[-1] in "12" else ""
         nominal = getattr(tip, f"{kind}_stiffness")
@@ -99,8 +105,9 @@ FINGERTIP_COMPLIANCE = HandEffect(
     parameters={
         n: Parameter(0.0, 4e-4, "m/N", low=-2.4e-4 if "normal" in n else -3.8e-4)
         for n in ("give_normal", "give_shear", *FINGERS)
-    },
-    forms=(("give_normal", "give_shear"), FINGERS),
+    }
+    | {"softness": SOFTNESS},
+    forms=(("give_normal", "give_shear"), FINGERS, ("softness",)),
     stage=CONTACT,
     correct=_correct_fingertip_compliance,
     report=_report_fingertip_compliance,

@@ -99,7 +99,8 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     leading = [u for _, u, _ in ranked[:LEADERS]]
     if len(leading) > 1:
         leading = [min((fit(given, (key,), u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
-    return fit(given, (key,), leading[0], usual=usual)
+    # An effect on moments may change most of how easily blocks turn in the grip.
+    return fit(given, (key,), fit(given, (key,), leading[0], usual=usual).u)
 
 
 def _linear_step(given: Problem, key: str, start: np.ndarray, usual: np.ndarray) -> tuple[float, np.ndarray]:

@@ -23,7 +23,7 @@ from simgap.gap.assemble import gap_of, scatters, together
 from simgap.gap.frame import CHANNELS, build, shown, shown_forms
 from simgap.gap.nuisances import shifted_by, with_nuisances
 from simgap.gap.problem import derivatives, fit, neutral, problem, slots
-from simgap.gap.search import Search, candidate_names, search
+from simgap.gap.search import Search, best_fit, candidate_names, search
 from simgap.gap.simulated import performed
 from simgap.gap.simulated import recorded as read_out
 from simgap.patch import checked, files, replayed
@@ -110,6 +110,20 @@ def test_the_better_of_two_joint_fits_counts(healthy, monkeypatch):
     np.testing.assert_allclose(starts[0][own], f.gap.candidates[0].at)
     np.testing.assert_allclose(starts[1][: given.num_common], best.x[: given.num_common])
     assert np.abs(starts[1][own]).max() < 0.05  # a healthy hand's
+
+
+def test_a_fit_converges_although_derivatives_from_before_the_effect_are_off():
+    """Cross-talk changes the moments that turn a block, and so what turning compliance does."""
+    trials, task, rig = recorded("none_1", 2)
+    mixed = {f"fy{k}": (f"fx{k}", 0.1) for k in (1, 2)} | {f"fx{k}": (f"fy{k}", -0.05) for k in (1, 2)}
+    read = [{c: t.channels[c] + share * t.channels[of] for c, (of, share) in mixed.items()} for t in trials]
+    made = [replace(t, channels=t.channels | each) for t, each in zip(trials, read, strict=True)]
+    given = with_nuisances(problem(build(align(made, task, rig))))
+    plain = fit(given, (), neutral(given))
+    off = replace(plain, jacobian=plain.jacobian * np.linspace(-1, 1, plain.jacobian.shape[1]))
+    exact = fit(given, ("force_crosstalk",), plain.u, steps=50).cost
+    assert best_fit(given, "force_crosstalk", off).cost == pytest.approx(exact, abs=0.1)
+    assert exact < plain.cost - 50
 
 
 def test_a_roll_is_as_large_as_it_was_beside_what_else_tilts_a_block(healthy):
