@@ -95,7 +95,9 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
     every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
     ranked = sorted(((*_linear_step(given, key, u, usual), u) for u in every), key=lambda r: r[0])
     if healthy.cost - ranked[0][0] < PROMISING:
-        return fit(given, (key,), ranked[0][2], 0, usual)
+        there = fit(given, (key,), ranked[0][2], 0, usual)
+        if there.cost < healthy.cost + PROMISING:  # else the step led too far to linearise there
+            return there
     leading = [u for _, u, _ in ranked[:LEADERS]]
     if len(leading) > 1:
         leading = [min((fit(given, (key,), u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
