@@ -22,6 +22,7 @@ from simgap.effects.base import (
     Spread,
     Values,
     gradient,
+    middle,
     mixing,
     of_forces,
     own,
@@ -284,9 +285,8 @@ def _scatter_clock_jitter(given: Any, residual: np.ndarray) -> Any:
 def _clock_rates(given: Any) -> np.ndarray:
     """Whitened change per second of clock error (T, N, C), whose mean over grouped samples counts."""
     world = given.frame.world
-    _, velocity = tips(world)
     step = np.median(np.diff(world.t, axis=1))
-    speed = (velocity[..., :2] + velocity[..., 2:]) / 2
+    speed = middle(tips(world)[1])
     rate = gradient(world.t, speed)
     out = np.zeros_like(given.weight)
     for k, c in enumerate((CHANNELS.index("vx"), CHANNELS.index("vy"))):
