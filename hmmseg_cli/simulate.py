@@ -14,7 +14,6 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.tables import listed
 from hmmseg_cli import options as opt
 from hmmseg_cli.console import Output, check_folder, read_trials
-from hmmseg_cli.options import Animation
 
 if TYPE_CHECKING:
     from hmmseg.segmentation.spans import Segmentation
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 def simulate(
     task: opt.Task, rig: opt.Rig, properties: opt.Properties = None, replay: opt.Replay = None,
     trials: opt.Count = 1, output: opt.SimulatedFolder = Path("simulated"), operator: opt.Operator = None,
-    animation: opt.Animated = False, animation_format: opt.AnimationFormat = Animation.GIF,
+    animation: opt.Animated = False, animation_format: opt.AnimationFormat = "gif",
     json: opt.Json = None, figures: opt.Figures = None, seed: opt.Seed = 0, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Perform a task with the calibrated virtual model, or replay a recording through it."""
@@ -40,7 +39,7 @@ def simulate(
         from simgap.world.simulate import scene_files
 
         if animation:
-            require_encoder(f".{animation_format.value}")
+            require_encoder(f".{animation_format}")
         description, hand = read_task(task), read_rig(rig)
         checked(hand.effects, str(rig))
         if not isinstance(description, BlockTask):
@@ -60,7 +59,7 @@ def simulate(
             out.stage(output / name).write_text(text, encoding="utf-8")
         written = [output / name for name in files]
         for stem, film in films.items() if animation else ():
-            written.append(output / f"{stem}.{animation_format.value}")
+            written.append(output / f"{stem}.{animation_format}")
             animate(out.stage(written[-1]), *film)
         out.print(f"wrote {len(written)} files into {output}")
         properties_of = {name: asdict(block) for name, block in blocks.items()}
