@@ -107,10 +107,11 @@ def _segment_apart(
     """Segment each recording by itself, in other processes."""
     found = []
     with out.progress("segmenting", len(paths)) as advance:
-        for each in segment_apart(paths, task, rig, workers, scheduler, advance, out.warn):
-            out.warn(*each.warnings)
-            out.print(*each.notes)
-            found.append(each.segmentation)
+        each = segment_apart(paths, task, rig, workers, scheduler, advance, out.warn)
+        for segmentation, warnings, notes in each:
+            out.warn(*warnings)
+            out.print(*notes)
+            found.append(segmentation)
     if not found:
         raise InputError(str(paths[0]), "the process that segmented it was killed, as of all others",
                          "enough memory, or fewer --workers")  # fmt: skip

@@ -17,11 +17,11 @@ from hmmseg_cli.console import Output, check_folder, read_trials
 
 if TYPE_CHECKING:
     from hmmseg.segmentation.spans import Segmentation
-    from simgap.world.animation import Scene, Trace
+    from simgap.world.animation import Scene, Traces
     from simgap.world.properties import Blocks
     from simgap.world.replay import Replay
 
-    Films = dict[str, tuple[Scene, list[Trace]]]  # by name what an animation shows
+    Films = Mapping[str, tuple[Scene, Traces]]  # by name what an animation shows
 
 
 def simulate(
@@ -73,7 +73,7 @@ def _perform(
     import numpy as np
 
     from simgap.patch import performed
-    from simgap.world.animation import Scene, Trace
+    from simgap.world.animation import Scene
     from simgap.world.operator import OperatorSettings, read_operator
     from simgap.world.simulate import trial_files
 
@@ -87,9 +87,9 @@ def _perform(
             out.warn(f"{stem}: the task failed (a block was not lifted or was dropped)")
         elif out.figures is not None:
             simulated.plot(out.figure(f"{stem}_signals.png"))
-        traces = [Trace("Grip [N]", [("", t, np.minimum(force[:, 0, 0], -force[:, 1, 0]))]),
-                  Trace("Net $f_y$ [N]", [("", t, force[..., 1].sum(1))]),
-                  Trace("Net $f_x$ [N]", [("", t, force[..., 0].sum(1))])]  # fmt: skip
+        shown = {"Grip": np.minimum(force[:, 0, 0], -force[:, 1, 0]), "Net $f_y$": force[..., 1].sum(1),
+                 "Net $f_x$": force[..., 0].sum(1)}  # fmt: skip
+        traces = {f"{label} [N]": {"": (t, values)} for label, values in shown.items()}
         films[stem] = Scene(t, simulated.motion, {name: blocks[name] for name in task.objects}, rig), traces
         rows.append({"file": f"{stem}.csv", **simulated.to_json()})
     return files, {"trials": rows}, films
@@ -104,7 +104,7 @@ def _replay(
     from hmmseg.io.trial import Trial
     from hmmseg.segmentation.align import segment
     from simgap.patch import replayed
-    from simgap.world.animation import Scene, Trace
+    from simgap.world.animation import Scene
     from simgap.world.replay import residual_summary
     from simgap.world.simulate import trial_files
 
@@ -128,9 +128,9 @@ def _replay(
     if out.figures is not None:
         _draw_replay(result, segmentation, out.figure(f"{path.stem}_replay.png"))
     signals, model = result.signals, result.predicted
-    traces = [Trace(f"{label} [N]", [("recording", signals.t, getattr(signals, key)),
-                                     ("virtual model", signals.t, model[key])])
-              for label, key in (("Grip", "grip"), ("Net $f_y$", "fy"), ("Shear", "shear"))]  # fmt: skip
+    shown = (("Grip", "grip"), ("Net $f_y$", "fy"), ("Shear", "shear"))
+    traces = {f"{label} [N]": {"recording": (signals.t, getattr(signals, key)),
+                               "virtual model": (signals.t, model[key])} for label, key in shown}  # fmt: skip
     document = {"replay": {"file": str(path), "boundaries": boundaries, "complete": segmentation.complete,
                            "net_force_residual_over_noise": summary}}  # fmt: skip
     scene = Scene(result.t, result.motion, {name: blocks[name] for name in task.objects}, rig)

@@ -89,10 +89,7 @@ JOINT_OFFSET = HandEffect(
     shows="positions, widths, heights, by pose",
     mistaken_for=("link_length",),
     called="joint angles with a wrong zero",
-    check=(
-        "Home the joints again against their stops, or put the fingertips on a gauge block and compare "
-        "angles."
-    ),
+    check="Home the joints against their stops, or put the fingertips on a gauge block and compare angles.",
     parameters={q: Parameter(0.0, 0.012, "rad") for q in JOINTS},
     admitted=lambda rig: ("joint_offset", dict(zip(JOINTS, rig.systematic.joint_offset, strict=True))),
     stage=KINEMATICS,
@@ -299,10 +296,7 @@ HAND_ROLL = HandEffect(
     shows="height difference of the fingers while carried",
     mistaken_for=("offcentre_mass", "fingertip_compliance"),
     called="a hand that rolls while it carries",
-    check=(
-        "Watch both fingertips' heights while carrying: the wrist or the arm turns; measure it, or "
-        "stiffen it."
-    ),
+    check="Watch both fingertips' heights while carrying: the wrist or the arm turns; measure or stiffen it.",
     parameters={"amplitude": Parameter(0.005, 1.0, "rad", log=True, low=1e-4, high=0.2)},
     stage=KINEMATICS,
     scatter=_scatter_hand_roll,

@@ -74,9 +74,7 @@ FORCE_DRIFT = of_forces(
     shows="a ramp over the trial, free motion too",
     mistaken_for=("fingertip_creep", "force_bias"),
     called="force sensors whose zero drifts",
-    check=(
-        "Record a minute in free air after switching on; let amplifiers and gauges warm up before a session."
-    ),
+    check="Record a minute in free air after switching on; let amplifiers and gauges warm up first.",
     parameters={c: Parameter(0.0, 0.015, "N/s") for c in FORCE_CHANNELS}
     | {"bend": Parameter(0.0, 0.15, low=-0.6, high=0.6, hidden=True, shape=True)},
     correct=unread(DRIFT, own(DRIFT), _since),
@@ -141,10 +139,7 @@ FORCE_CROSSTALK = mixing(
     shows="shear and net force follow the grip",
     mistaken_for=("sensor_rotation",),
     called="cross-talk between the axes of a force sensor",
-    check=(
-        "Press straight against a wall with one finger and see whether the other axis moves; redo the "
-        "calibration matrix."
-    ),
+    check="Press straight on a wall with one finger: if the other axis moves, redo the calibration matrix.",
     parameters={n: Parameter(0.0, 0.06, low=-0.2, high=0.2) for n in ("fy_from_fx", "fx_from_fy")},
     stage=MIX,
 )
@@ -187,10 +182,7 @@ FORCE_LAG = of_forces(
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
     called="force readings that come late",
-    check=(
-        "Tap a fingertip sharply and compare the time stamps of force and motion; look for a buffer in "
-        "the force channel."
-    ),
+    check="Tap a fingertip and compare the time stamps of force and motion; look for a buffer of the forces.",
     phrase=_of_fingers("force readings that come late"),
     parameters={
         n: Parameter(
@@ -212,10 +204,7 @@ FORCE_LOWPASS = of_forces(
     shows="rounded contact changes",
     mistaken_for=("force_lag",),
     called="a slow filter in the force channel",
-    check=(
-        "Look up the filter setting of the force amplifier or driver; tap a fingertip and see how fast "
-        "the reading rises."
-    ),
+    check="Look up the filter of the amplifier or driver; tap a fingertip and see how fast readings rise.",
     phrase=_of_fingers("a slow filter in the force channel"),
     parameters={
         n: Parameter(0.0, 0.08, "s", starts=(0.02, 0.06, 0.12, 0.2), low=0.0, high=0.5)

@@ -329,20 +329,9 @@ def _there(
     both[1:-1] &= (place & speed)[2:] & (place & speed)[:-2]
     near = speed.copy()
     near[1:-1] &= speed[2:] & speed[:-2]
-    inertial = force & near
-    columns = {
-        "x": still & force & place,
-        "y": (still | (phase == Phase.SLIDE)) & force & place,
-        "distance": held & force & place,
-        "offset": held & force & place,
-        "vx": both,
-        "vy": both,
-        "fx": (free & force) | (carry & inertial),
-        "fy": (free & force) | (carry & inertial),
-        "grip": free & force,
-        "shear": free & force,
-    }
-    return np.stack([columns[c] for c in CHANNELS], 1).astype(float)
+    slid, seen, net = still | (phase == Phase.SLIDE), force & place, force & (free | (carry & near))
+    x, y, apart, open_ = still & seen, slid & seen, held & seen, free & force
+    return np.stack([x, y, apart, apart, both, both, net, net, open_, open_], 1).astype(float)
 
 
 class Arrays(NamedTuple):
