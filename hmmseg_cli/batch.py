@@ -13,7 +13,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +25,8 @@ from hmmseg.segmentation.spans import Segmentation
 
 LOCAL = "local"
 PATIENCE = 10.0  # limit: s to wait for a cluster
-
-
-@dataclass(frozen=True)
-class Segmented:
-    """Segmentation of one recording, with the warnings and notes of reading it."""
-
-    segmentation: Segmentation
-    warnings: tuple[str, ...]
-    notes: tuple[str, ...]
+# Segmentation of one recording, with the warnings and notes of reading it.
+Segmented = tuple[Segmentation, Sequence[str], Sequence[str]]
 
 
 def recordings_in(paths: Sequence[Path]) -> list[Path]:
@@ -68,7 +61,7 @@ def segment_one(path: Path, task: Path, rig: Path) -> Segmented:
     description, hand = _lab(task, rig)
     trial = read_trial(path, hand)
     segmentation = replace(segment([trial], description, hand)[0], recorded=None)
-    return Segmented(segmentation, tuple(trial.warnings), tuple(trial.notes))
+    return segmentation, trial.warnings, trial.notes
 
 
 def segment_apart(
@@ -96,7 +89,7 @@ def segment_apart(
                     if found is None:
                         tell(f"{path}: the process that segmented it was killed, twice; it is left out")
                     else:
-                        yield replace(found, segmentation=replace(found.segmentation, file=str(path)))
+                        yield replace(found[0], file=str(path)), *found[1:]
                     if lost:  # a pool is lost with any of its processes, and a cluster may be gone
                         scheduler = None
                         break

@@ -16,7 +16,7 @@ import shutil
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -249,6 +249,13 @@ def require_rig(rig: Path | None, trials: Sequence[Path]) -> Path:
         expected = f"the nominal hand of a task of blocks, or a rig.toml in {split_part(trials[0])[0].parent}"
         raise InputError("--rig", "missing", expected)
     return rig
+
+
+def refuse(problem: str, given: Mapping[str, Any]) -> None:
+    """InputError for the first option given."""
+    for option, value in given.items():
+        if value:
+            raise InputError(option, problem)
 
 
 def _keys(path: Path | None) -> set[str]:

@@ -8,7 +8,6 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli import diagnose, identify
 from hmmseg_cli import options as opt
 from hmmseg_cli.console import Output
-from hmmseg_cli.options import Estimator
 
 
 def demo(figures: opt.DemoFigures = Path("demo"), json: opt.Json = None, seed: opt.Seed = 0,
@@ -20,7 +19,7 @@ def demo(figures: opt.DemoFigures = Path("demo"), json: opt.Json = None, seed: o
         trials, actual = sorted(folder.glob("trial_*.csv")), folder / "actual.toml"
         task, rig = read_task(folder / "task.toml"), read_rig(folder / "rig.toml")
         assert isinstance(task, BlockTask)
-        body = identify.run(out, trials, task, rig, Estimator.BAYES, actual)
+        body = identify.run(out, trials, task, rig, "bayes", actual)
         rigid = rig.fingertip.model_copy(update={"normal_stiffness": float("inf")})
         out.print("\nThe same recordings, with fingertips assumed rigid as in the paper:")
         out.report = finding

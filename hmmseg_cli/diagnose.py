@@ -20,6 +20,7 @@ from hmmseg_cli.console import (
     distinct_trials,
     find_inputs,
     read_trials,
+    refuse,
     require_rig,
 )
 from hmmseg_cli.robot import OwnSimulator, compare_robot, diagnose_robot
@@ -99,13 +100,6 @@ def diagnose(
 
 
 diagnose.cls = Diagnose  # type: ignore[attr-defined]
-
-
-def refuse(problem: str, given: dict[str, Any]) -> None:
-    """InputError for the first option given."""
-    for option, value in given.items():
-        if value:
-            raise InputError(option, problem)
 
 
 def _patch(out: Output, found: Diagnosis, rig: Path, folder: Path) -> None:

@@ -11,7 +11,6 @@ from hmmseg.io.rig import Rig, read_rig
 from hmmseg.io.task import BlockTask, read_task
 from hmmseg_cli import options as opt
 from hmmseg_cli.console import Output, distinct_trials, find_inputs, read_trials, require_rig
-from hmmseg_cli.options import Estimator
 from hmmseg_cli.segment import warn_of_misfits
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
 
 def identify(
     trials: opt.Trials, task: opt.TaskFound = None, rig: opt.RigFound = None,
-    method: opt.IdentifyMethod = Estimator.BAYES, actual: opt.Actual = None, json: opt.Json = None,
+    method: opt.IdentifyMethod = "bayes", actual: opt.Actual = None, json: opt.Json = None,
     figures: opt.Figures = None, report: opt.Report = None, seed: opt.Seed = 0, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Weight, width, height and friction of every block, with uncertainties; trials are pooled."""
@@ -36,7 +35,7 @@ def identify(
 
 
 def run(
-    out: Output, trials: Sequence[Path], task: BlockTask, hand: Rig, method: Estimator, actual: Path | None
+    out: Output, trials: Sequence[Path], task: BlockTask, hand: Rig, method: opt.Estimator, actual: opt.File
 ) -> dict[str, Any]:
     """Identify, write table, figures and page to the destinations of `out`, and return the document."""
     from estimation.report import compare, disagreements, properties_table, read_actual
@@ -44,7 +43,7 @@ def run(
     paths, found = distinct_trials(trials), None
     measured = None if actual is None else read_actual(actual, task.objects)
     recordings = read_trials(out, paths, hand)
-    if method is Estimator.PAPER:
+    if method == "paper":
         body, segmentations = _paper(out, recordings, task, hand)
     else:
         found = _bayes(out, recordings, task, hand)

@@ -150,11 +150,11 @@ def new(
             _lay_out_map(out, targets[0], mjcf, source, looked)
             out.finish({"files": [str(targets[0])], "hand": None})
             return
-        hand, rate = (hand or Hand.CARTESIAN, 50.0) if looked is None else _seen(hand, looked)
+        hand, rate = (hand or "cartesian", 50.0) if looked is None else _seen(hand, looked)
         pages = Environment(loader=PackageLoader("hmmseg_cli"), keep_trailing_newline=True, autoescape=False)
         for path, read in zip(targets, (read_rig, read_task), strict=True):
             staged = out.stage(path)
-            text = pages.get_template(f"{path.name}.j2").render(hand=hand.value, rate=rate)
+            text = pages.get_template(f"{path.name}.j2").render(hand=hand, rate=rate)
             staged.write_text(text, encoding="utf-8")
             if looked is not None and looked.toml and path == targets[0]:
                 staged.write_text(extended(staged, [looked]), encoding="utf-8")
@@ -164,17 +164,16 @@ def new(
             files = shlex.join([str(source), "--task", str(targets[1]), "--rig", str(targets[0])])
             then = f"say in task.toml what goes where, then: hmmseg segment {files}"
         out.print(f"wrote {targets[0]} and {targets[1]}; {then}")
-        out.finish({"files": [str(path) for path in targets], "hand": hand.value})
+        out.finish({"files": [str(path) for path in targets], "hand": hand})
 
 
 def _seen(hand: Hand | None, looked: Inspection) -> tuple[Hand, float]:
     """The hand and its sampling rate [Hz], from a recording."""
     names = {channel.name for channel in looked.channels} | set(looked.mapping or ())
     if hand is None and "[gripper]" in looked.toml:
-        hand = Hand.GRIPPER
+        hand = "gripper"
     if hand is None:
-        kinds = {Hand.JOINTED: {"q11", "q21"}, Hand.CARTESIAN: {"x1", "x2"}}
-        hand = next((kind for kind, needed in kinds.items() if needed <= names), Hand.NONE)
+        hand = "jointed" if {"q11", "q21"} <= names else "cartesian" if {"x1", "x2"} <= names else "none"
     return hand, float(f"{looked.rate or 50.0:.4g}")
 
 

@@ -9,7 +9,6 @@ Tables (CSV, Parquet) get the columns `subtask_index` (from 0), `subtask`, `obje
 import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -84,42 +83,30 @@ TOPIC = "/hmmseg/subtask"
 ADDED = ("subtask_index", "subtask", "object", "state", "boundary_sd")
 
 
-@dataclass(frozen=True)
-class Labels:
-    """Index of the span of each sample (num_timesteps,), -1 outside all, and its boundary sd [s]."""
+def label(t: np.ndarray, spans: Sequence[Span]) -> tuple[np.ndarray, np.ndarray]:
+    """Index (num_timesteps,) of the span of each sample at t [s], -1 outside all, and its boundary sd [s].
 
-    index: np.ndarray
-    boundary_sd: np.ndarray
-    spans: tuple[Span, ...]
-
-    def names(self, field: str) -> np.ndarray:
-        """A field of each sample's span, empty outside all."""
-        entries = [getattr(span, field) or "" for span in self.spans]
-        return np.array([*entries, ""], dtype=object)[self.index]
-
-
-def label(t: np.ndarray, spans: Sequence[Span]) -> Labels:
-    """Labels of samples at t (num_timesteps,) [s]; spans are half-open, except for the end of the last."""
+    Spans are half-open, except for the end of the last."""
     if not spans:
-        return Labels(np.full(t.size, -1), np.full(t.size, np.nan), ())
+        return np.full(t.size, -1), np.full(t.size, np.nan)
     starts, ends, start_sd, end_sd = np.array([(s.start, s.end, s.start_sd, s.end_sd) for s in spans]).T
     index = np.searchsorted(starts, t, side="right") - 1
     last = (index == len(spans) - 1) & (t == ends[-1])
     index = np.where((index >= 0) & ((t < ends[index]) | last), index, -1)
     sd = np.where(t - starts[index] < ends[index] - t, start_sd[index], end_sd[index])
-    return Labels(index, np.where(index < 0, np.nan, sd), tuple(spans))
+    return index, np.where(index < 0, np.nan, sd)
 
 
 def write_table(path: Path, source: str | Path, trial: Trial, spans: Sequence[Span]) -> None:
     """Write the source's columns with the labels added, as CSV or Parquet by the path's suffix."""
-    table, labels = read_table(source), label(trial.t, spans)
+    table, (index, sd) = read_table(source), label(trial.t, spans)
     for name in ADDED:
         if name in table.names:
             raise InputError(f"{source}: column {name}", "is there already", "a recording without labels")
     columns = {"t": trial.t, **trial.channels} if table.messages else table.columns
-    names = {field: labels.names(field) for field in ("subtask", "object", "state")}
-    added = {"subtask_index": labels.index, **names, "boundary_sd": labels.boundary_sd}
-    frame = pd.DataFrame(columns).assign(**added)
+    names = {field: np.array([*(getattr(s, field) or "" for s in spans), ""], dtype=object)[index]
+             for field in ("subtask", "object", "state")}  # fmt: skip
+    frame = pd.DataFrame(columns).assign(subtask_index=index, **names, boundary_sd=sd)
     write = frame.to_parquet if path.suffix.lower() == ".parquet" else frame.to_csv
     write(path, index=False)
 
@@ -203,7 +190,7 @@ def _write_episodes(file: Path, labelled: Mapping[int, tuple[Trial, Sequence[Spa
     for number, (trial, spans) in labelled.items():
         rows = episodes == number
         if rows.sum() == trial.t.size:
-            sd[rows] = label(trial.t, spans).boundary_sd
+            sd[rows] = label(trial.t, spans)[1]
             stamped = "timestamp" in table.column_names
             since = table.column("timestamp").to_numpy()[rows] if stamped else trial.t
             subtasks[number] = [(float(np.interp(s.start, trial.t, since)), s.label) for s in spans]

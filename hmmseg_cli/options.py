@@ -1,8 +1,7 @@
 """Arguments and options of all commands: type, flag and line of help."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -11,36 +10,10 @@ GIVEN = "Recordings against simulated trials of your own"
 ROBOT = "A robot against your own model of it"
 
 
-class Segmenter(StrEnum):
-    """How recordings are segmented."""
-
-    HMM = "hmm"
-    QUALITATIVE = "qualitative"
-
-
-class Estimator(StrEnum):
-    """How properties are estimated."""
-
-    BAYES = "bayes"
-    PAPER = "paper"
-
-
-class Hand(StrEnum):
-    """Kinds of hand that a rig describes."""
-
-    CARTESIAN = "cartesian"
-    JOINTED = "jointed"
-    GRIPPER = "gripper"
-    NONE = "none"
-
-
-class Animation(StrEnum):
-    """Kinds of animation."""
-
-    GIF = "gif"
-    MP4 = "mp4"
-
-
+Segmenter = Literal["hmm", "qualitative"]
+Estimator = Literal["bayes", "paper"]
+Hand = Literal["cartesian", "jointed", "gripper", "none"]
+Animation = Literal["gif", "mp4"]
 File = Path | None
 Names = list[str] | None
 Paths = list[Path] | None

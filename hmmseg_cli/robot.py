@@ -17,7 +17,7 @@ from hmmseg.errors import InputError
 from hmmseg.numbers import estimate, interval, shown_as
 from hmmseg.tables import listed
 from hmmseg_cli import options as opt
-from hmmseg_cli.console import Output, check_file, check_folder, distinct_trials, strict_json
+from hmmseg_cli.console import Output, check_file, check_folder, distinct_trials, refuse, strict_json
 from simgap.report.finding import sentence
 from simgap.report.finding import tables as usual_tables
 
@@ -49,28 +49,23 @@ class OwnSimulator:
     @property
     def given(self) -> bool:
         """Whether a model was given; InputError for options that go only with one."""
-        of_mjcf = {"--map": self.map_file, "--candidate": next(iter(self.candidates), None)}
         if self.mjcf is None:
-            for option, value in of_mjcf.items():
-                if value is not None:
-                    raise InputError(f"{option} {value}", "goes with a MuJoCo model", "--mjcf XML")
+            of_mjcf = {"--map": self.map_file, "--candidate": self.candidates}
+            refuse("goes with a MuJoCo model, --mjcf XML", of_mjcf)
         elif self.simulator is not None:
             raise InputError("--mjcf", "does not go with --simulator", "one model")
         elif self.map_file is None:
             what = "which column is which joint, actuator or sensor of the model"
             raise InputError("--map", "missing", what)
-        if self.simulator is not None or self.mjcf is not None:
-            return True
-        for option, value in {"--history": self.history, "--rerun": self.rerun}.items():
-            if value is not None:
-                raise InputError(f"{option} {value}", "goes with a model of a robot", "--mjcf XML")
-        return False
+        if self.simulator is None and self.mjcf is None:
+            of_robots = {"--history": self.history, "--rerun": self.rerun}
+            refuse("goes with a model of a robot, --mjcf XML", of_robots)
+            return False
+        return True
 
     def check_alone(self, others: Mapping[str, Any]) -> None:
         """InputError for options without meaning for an owner's model, and for unwritable destinations."""
-        for option, value in others.items():
-            if value:
-                raise InputError(option, "does not go with a simulator of your own")
+        refuse("does not go with a simulator of your own", others)
         if self.patch is not None:
             check_folder("--patch", self.patch)
         if self.history is not None:

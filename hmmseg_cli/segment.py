@@ -18,7 +18,6 @@ from hmmseg.segmentation.spans import Segmentation, most_telling, spans_table, t
 from hmmseg_cli import options as opt
 from hmmseg_cli.batch import recordings_in, segment_apart
 from hmmseg_cli.console import Output, check_file, distinct_trials, find_inputs, read_trials, require_rig
-from hmmseg_cli.options import Segmenter
 
 if TYPE_CHECKING:
     from hmmseg.io.trial import Trial
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 def segment(
     trials: opt.Trials, task: opt.TaskFound = None, rig: opt.RigFound = None, model: opt.LearnedModel = None,
-    method: opt.SegmentMethod = Segmenter.HMM, force_threshold: opt.ForceThreshold = 0.05,
+    method: opt.SegmentMethod = "hmm", force_threshold: opt.ForceThreshold = 0.05,
     velocity_threshold: opt.VelocityThreshold = 0.05, write: opt.WrittenLabels = None, json: opt.Json = None,
     figures: opt.Figures = None, seed: opt.UnusedSeed = 0, quiet: opt.Quiet = False,
     workers: opt.Workers = None, scheduler: opt.Scheduler = None,
@@ -39,7 +38,7 @@ def segment(
     from hmmseg_cli.labels import check_destination, write_labels
 
     with Output("segment", json=json, figures=figures, seed=seed, quiet=quiet) as out:
-        if method is Segmenter.HMM and (force_threshold, velocity_threshold) != (0.05, 0.05):
+        if method == "hmm" and (force_threshold, velocity_threshold) != (0.05, 0.05):
             where = "--force-threshold, --velocity-threshold"
             raise InputError(where, "go only with the paper's thresholds", "--method qualitative")
         apart = workers is not None or scheduler is not None
@@ -51,7 +50,7 @@ def segment(
         if isinstance(description, SequenceTask):
             if apart:
                 raise InputError("--workers, --scheduler", "go with tasks of blocks alone")
-            if method is Segmenter.QUALITATIVE:
+            if method == "qualitative":
                 raise InputError("--method qualitative", "needs a task of blocks", "--method hmm")
             recordings, found = _segment_sequence(out, paths, description, rig, model)
         else:
@@ -59,9 +58,9 @@ def segment(
             if model is not None:
                 raise InputError(f"--model {model}", "goes only with a plain ordered task")
             if not apart:
-                thresholds = None if method is Segmenter.HMM else (force_threshold, velocity_threshold)
+                thresholds = None if method == "hmm" else (force_threshold, velocity_threshold)
                 recordings, found = _segment_blocks(out, paths, description, rig, thresholds, write is None)
-            elif write is not None or figures is not None or method is not Segmenter.HMM:
+            elif write is not None or figures is not None or method != "hmm":
                 raise InputError("--workers, --scheduler", "go with --json alone")
             else:
                 found = _segment_apart(out, paths, task, rig, workers, scheduler)
@@ -79,7 +78,7 @@ def segment(
         if write is not None:
             write_labels(out, write, paths, recordings, found)
         open_ones = {} if question is None else {"question": asdict(question)}
-        out.finish({"method": method.value, "trials": [s.to_json() for s in found]} | open_ones)
+        out.finish({"method": method, "trials": [s.to_json() for s in found]} | open_ones)
 
 
 def _segment_blocks(
@@ -108,10 +107,11 @@ def _segment_apart(
     """Segment each recording by itself, in other processes."""
     found = []
     with out.progress("segmenting", len(paths)) as advance:
-        for each in segment_apart(paths, task, rig, workers, scheduler, advance, out.warn):
-            out.warn(*each.warnings)
-            out.print(*each.notes)
-            found.append(each.segmentation)
+        each = segment_apart(paths, task, rig, workers, scheduler, advance, out.warn)
+        for segmentation, warnings, notes in each:
+            out.warn(*warnings)
+            out.print(*notes)
+            found.append(segmentation)
     if not found:
         raise InputError(str(paths[0]), "the process that segmented it was killed, as of all others",
                          "enough memory, or fewer --workers")  # fmt: skip

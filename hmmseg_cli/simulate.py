@@ -14,21 +14,20 @@ from hmmseg.io.task import BlockTask, read_task
 from hmmseg.tables import listed
 from hmmseg_cli import options as opt
 from hmmseg_cli.console import Output, check_folder, read_trials
-from hmmseg_cli.options import Animation
 
 if TYPE_CHECKING:
     from hmmseg.segmentation.spans import Segmentation
-    from simgap.world.animation import Scene, Trace
+    from simgap.world.animation import Scene, Traces
     from simgap.world.properties import Blocks
     from simgap.world.replay import Replay
 
-    Films = dict[str, tuple[Scene, list[Trace]]]  # by name what an animation shows
+    Films = Mapping[str, tuple[Scene, Traces]]  # by name what an animation shows
 
 
 def simulate(
     task: opt.Task, rig: opt.Rig, properties: opt.Properties = None, replay: opt.Replay = None,
     trials: opt.Count = 1, output: opt.SimulatedFolder = Path("simulated"), operator: opt.Operator = None,
-    animation: opt.Animated = False, animation_format: opt.AnimationFormat = Animation.GIF,
+    animation: opt.Animated = False, animation_format: opt.AnimationFormat = "gif",
     json: opt.Json = None, figures: opt.Figures = None, seed: opt.Seed = 0, quiet: opt.Quiet = False,
 ) -> None:  # fmt: skip
     """Perform a task with the calibrated virtual model, or replay a recording through it."""
@@ -40,7 +39,7 @@ def simulate(
         from simgap.world.simulate import scene_files
 
         if animation:
-            require_encoder(f".{animation_format.value}")
+            require_encoder(f".{animation_format}")
         description, hand = read_task(task), read_rig(rig)
         checked(hand.effects, str(rig))
         if not isinstance(description, BlockTask):
@@ -60,7 +59,7 @@ def simulate(
             out.stage(output / name).write_text(text, encoding="utf-8")
         written = [output / name for name in files]
         for stem, film in films.items() if animation else ():
-            written.append(output / f"{stem}.{animation_format.value}")
+            written.append(output / f"{stem}.{animation_format}")
             animate(out.stage(written[-1]), *film)
         out.print(f"wrote {len(written)} files into {output}")
         properties_of = {name: asdict(block) for name, block in blocks.items()}
@@ -74,7 +73,7 @@ def _perform(
     import numpy as np
 
     from simgap.patch import performed
-    from simgap.world.animation import Scene, Trace
+    from simgap.world.animation import Scene
     from simgap.world.operator import OperatorSettings, read_operator
     from simgap.world.simulate import trial_files
 
@@ -88,9 +87,9 @@ def _perform(
             out.warn(f"{stem}: the task failed (a block was not lifted or was dropped)")
         elif out.figures is not None:
             simulated.plot(out.figure(f"{stem}_signals.png"))
-        traces = [Trace("Grip [N]", [("", t, np.minimum(force[:, 0, 0], -force[:, 1, 0]))]),
-                  Trace("Net $f_y$ [N]", [("", t, force[..., 1].sum(1))]),
-                  Trace("Net $f_x$ [N]", [("", t, force[..., 0].sum(1))])]  # fmt: skip
+        shown = {"Grip": np.minimum(force[:, 0, 0], -force[:, 1, 0]), "Net $f_y$": force[..., 1].sum(1),
+                 "Net $f_x$": force[..., 0].sum(1)}  # fmt: skip
+        traces = {f"{label} [N]": {"": (t, values)} for label, values in shown.items()}
         films[stem] = Scene(t, simulated.motion, {name: blocks[name] for name in task.objects}, rig), traces
         rows.append({"file": f"{stem}.csv", **simulated.to_json()})
     return files, {"trials": rows}, films
@@ -105,7 +104,7 @@ def _replay(
     from hmmseg.io.trial import Trial
     from hmmseg.segmentation.align import segment
     from simgap.patch import replayed
-    from simgap.world.animation import Scene, Trace
+    from simgap.world.animation import Scene
     from simgap.world.replay import residual_summary
     from simgap.world.simulate import trial_files
 
@@ -129,9 +128,9 @@ def _replay(
     if out.figures is not None:
         _draw_replay(result, segmentation, out.figure(f"{path.stem}_replay.png"))
     signals, model = result.signals, result.predicted
-    traces = [Trace(f"{label} [N]", [("recording", signals.t, getattr(signals, key)),
-                                     ("virtual model", signals.t, model[key])])
-              for label, key in (("Grip", "grip"), ("Net $f_y$", "fy"), ("Shear", "shear"))]  # fmt: skip
+    shown = (("Grip", "grip"), ("Net $f_y$", "fy"), ("Shear", "shear"))
+    traces = {f"{label} [N]": {"recording": (signals.t, getattr(signals, key)),
+                               "virtual model": (signals.t, model[key])} for label, key in shown}  # fmt: skip
     document = {"replay": {"file": str(path), "boundaries": boundaries, "complete": segmentation.complete,
                            "net_force_residual_over_noise": summary}}  # fmt: skip
     scene = Scene(result.t, result.motion, {name: blocks[name] for name in task.objects}, rig)

@@ -62,11 +62,6 @@ class Parameter:
         return float(np.log(value / self.nominal) / self.sd if self.log else (value - self.nominal) / self.sd)
 
     @property
-    def gridded(self) -> bool:
-        """Whether a search has to try several start values."""
-        return bool(self.starts)
-
-    @property
     def limits(self) -> tuple[float, float]:
         """Bounds of the coordinate: at most five standard deviations of a logarithm, GROSS otherwise."""
         low = self.coordinate(self.low) if self.low > (0 if self.log else -np.inf) else -np.inf

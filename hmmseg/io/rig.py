@@ -32,14 +32,8 @@ def _several(value: Any) -> Any:
     return (value,) if isinstance(value, str) else value
 
 
-def _counted(names: tuple[str, ...], counts: tuple[int, ...], expected: str) -> tuple[str, ...]:
-    """Names of columns, of which there must be as many as one of `counts`; ValueError otherwise."""
-    if len(names) not in counts:
-        raise ValueError(f"has {len(names)} columns; expected {expected}")
-    return names
-
-
 ByAxis = Annotated[dict[Axis, Name], BeforeValidator(_by_axis)]
+Opening = Annotated[tuple[Name, ...], BeforeValidator(_several), Field(min_length=1, max_length=2)]
 Place = tuple[Finite, Finite, Finite]
 
 
@@ -51,7 +45,7 @@ class Gripper(StrictTable):
     quaternion: tuple[Name, Name, Name, Name] | None = None  # x, y, z, w
     rotation_vector: tuple[Name, Name, Name] | None = None  # axis times angle [rad] instead
     up: Direction = "z"  # axis of the world against gravity
-    opening: Annotated[tuple[Name, ...], BeforeValidator(_several)] = ("opening",)  # [m], or of each finger
+    opening: Opening = ("opening",)  # [m], or of each finger
     wrench: tuple[Name, ...] = ("fx", "fy", "fz")  # [N], and optionally tx, ty, tz [N m]
     frame: Literal["sensor", "tool", "world"] = "sensor"  # whose axes the wrench has
     # Axes of the tool along which the sensor's x, y, z point; by default found from free motion.
@@ -68,12 +62,9 @@ class Gripper(StrictTable):
     @field_validator("wrench")
     @classmethod
     def _whole(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        return _counted(names, (3, 6), "3 forces, or 3 forces and 3 torques")
-
-    @field_validator("opening")
-    @classmethod
-    def _of_fingers(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        return _counted(names, (1, 2), "one, or one for each finger")
+        if len(names) not in (3, 6):
+            raise ValueError(f"has {len(names)} columns; expected 3 forces, or 3 forces and 3 torques")
+        return names
 
     @field_validator("sensor_axes")
     @classmethod

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -33,15 +33,16 @@ class Table:
 
 
 def make_table(
-    file: str, columns: dict[str, np.ndarray], rest: Sequence[str] = (), wanted: Sequence[str] | None = None
+    file: str, columns: dict[str, np.ndarray], names: Iterable[str] = (), wanted: Sequence[str] | None = None
 ) -> Table:
-    """A table whose rows count from 1, as many as most columns have; `rest`: columns that were not read."""
+    """A table whose rows count from 1, as many as most columns have; `names`: all columns, read or not."""
     columns = flat(columns)
+    every = (*columns, *(n for n in names if n not in columns and f"{n}[0]" not in columns))
     if wanted is not None:
         columns = {name: values for name, values in columns.items() if name in wanted}
     lengths = [len(values) for values in columns.values()]
     count = max(lengths, key=lengths.count, default=0)
-    return Table(file, (*columns, *rest), columns, np.arange(1, count + 1))
+    return Table(file, every, columns, np.arange(1, count + 1))
 
 
 def is_wanted(name: str, wanted: Sequence[str] | None) -> bool:
@@ -167,7 +168,7 @@ def frame_table(source: Any, wanted: Sequence[str] | None) -> Table:
     check_unique(names, where)
     kept = {name: _array(values) for name, (_, values) in zip(names, named, strict=True)
             if is_wanted(name, wanted)}  # fmt: skip
-    return make_table(where, kept, [name for name in names if name not in kept])
+    return make_table(where, kept, names)
 
 
 def _array(values: Any) -> np.ndarray:

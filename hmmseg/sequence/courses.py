@@ -185,14 +185,8 @@ class Weighing:
     unseen: float  # prior weight of a change that the channels do not show, relative to one that they do
 
 
-WEIGHING = Weighing(
-    independent=80.4,  # learned: by `experiments.sequences learn --worlds 40`
-    settled=-3.84,  # learned: by `experiments.sequences learn --worlds 40`
-    shares=0.035,  # learned: by `experiments.sequences learn --worlds 40`
-    lag=0.0074,  # learned: by `experiments.sequences learn --worlds 40`
-    labelled=0.0050,  # learned: by `experiments.sequences learn --worlds 40`
-    elsewhere=0.009,  # learned: by `experiments.sequences learn --worlds 40`
-    unseen=0.015,  # learned: by `experiments.sequences learn --worlds 40`
+WEIGHING = Weighing(  # learned: by `experiments.sequences learn --worlds 40`
+    independent=80.4, settled=-3.84, shares=0.035, lag=0.0074, labelled=0.005, elsewhere=0.009, unseen=0.015
 )
 
 

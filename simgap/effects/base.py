@@ -73,28 +73,28 @@ class World(NamedTuple):
     length: Array
     jointed: Array
     gravity: Array
-    link: Array
     give_normal: Array
     give_shear: Array
-    delay: Array
-    smoothing: Array
-    creep: Array
-    creep_time: Array
-    tilt: Array
-    give_support: Array
-    support_time: Array
-    inertia: Array
-    couple: Array
-    loudness: Array
-    ring: Array
     slip: Array
-    modes: Array
     free: Array
     ground: Array
     carry: Array
     events: Array
-    hang: Array | float = 0.0
-    off: Array | float = 0.0
+    link: Array = np.ones(4)  # from here on, defaults are what no effect has changed
+    delay: Array = np.zeros(4)
+    smoothing: Array = np.zeros(4)
+    creep: Array = 0.0
+    creep_time: Array = 1.0
+    tilt: Array = 0.0
+    give_support: Array = 0.0
+    support_time: Array = 0.0
+    inertia: Array = 1.0
+    couple: Array = 0.0
+    loudness: Array = np.ones(4)
+    ring: Array = np.array([1.0, 0.05, 0.0])
+    modes: Array = np.zeros(6)
+    hang: Array = 0.0
+    off: Array = 0.0
     dead_band: DeadBand | None = None
 
 
@@ -208,6 +208,11 @@ def tips(world: World) -> tuple[Array, Array]:
     velocity = paired(jx * world.rates, jy * world.rates)
     there = world.jointed > 0.5
     return np.where(there, position, world.joints), np.where(there, velocity, world.rates)
+
+
+def middle(values: Array) -> Array:
+    """Means (..., 2) of both fingers' x and y, from x1, y1, x2, y2 (..., 4)."""
+    return (values[..., :2] + values[..., 2:]) / 2
 
 
 def with_mode(world: World, mode: int, on: Array) -> World:

@@ -11,6 +11,7 @@ import tomlkit
 
 from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
+from hmmseg.io.rig import JOINTS
 from simgap import channels
 from simgap.effect import Array, Parameter
 from simgap.effects.base import (
@@ -29,7 +30,6 @@ from simgap.phases import Phase
 
 # A hand that differs from its drawing: angles with offsets, links longer than nominal (all alike, or each).
 
-JOINTS = ("q11", "q12", "q21", "q22")
 LINKS = ("link11", "link12", "link21", "link22")
 
 
@@ -53,17 +53,13 @@ def apply_hand(p: Performance, values: Values, rng: np.random.Generator) -> Perf
 def moved_joints(p: Performance, values: Values, change: Callable[[np.ndarray], np.ndarray]) -> Performance:
     """Tips as computed with nominal geometry from the angles (n, 4) of the true hand, passed through
     `change`."""
-    if not p.rig.jointed:
-        raise ValueError("a Cartesian hand has no joints")
     longer = _numbers(values, LINKS, "scale").reshape(2, 2)
-    q, dq = [], []
-    for i in (1, 2):
-        nominal = p.rig.finger(i)
+    fingers, q, dq = [p.rig.finger(i) for i in (1, 2)], [], []
+    for i, nominal in enumerate(fingers, 1):
         true = nominal.model_copy(update={"links": tuple(nominal.links * (1 + longer[i - 1]))})
         q.append(inverse(true, i, p.position[:, i - 1]))
         dq.append(joint_velocity(true, q[-1], p.velocity[:, i - 1]))
     read = np.split(change(np.concatenate(q, 1)), 2, axis=1)
-    fingers = [p.rig.finger(i) for i in (1, 2)]
     position = np.stack([forward(f, a) for f, a in zip(fingers, read, strict=True)], 1)
     velocity = np.stack([tip_velocity(f, a, da) for f, a, da in zip(fingers, read, dq, strict=True)], 1)
     return p._replace(position=position, velocity=velocity)
@@ -93,10 +89,7 @@ JOINT_OFFSET = HandEffect(
     shows="positions, widths, heights, by pose",
     mistaken_for=("link_length",),
     called="joint angles with a wrong zero",
-    check=(
-        "Home the joints again against their stops, or put the fingertips on a gauge block and compare "
-        "angles."
-    ),
+    check="Home the joints against their stops, or put the fingertips on a gauge block and compare angles.",
     parameters={q: Parameter(0.0, 0.012, "rad") for q in JOINTS},
     admitted=lambda rig: ("joint_offset", dict(zip(JOINTS, rig.systematic.joint_offset, strict=True))),
     stage=KINEMATICS,
@@ -315,10 +308,7 @@ HAND_ROLL = HandEffect(
     shows="height difference of the fingers while carried",
     mistaken_for=("offcentre_mass", "fingertip_compliance"),
     called="a hand that rolls while it carries",
-    check=(
-        "Watch both fingertips' heights while carrying: the wrist or the arm turns; measure it, or "
-        "stiffen it."
-    ),
+    check="Watch both fingertips' heights while carrying: the wrist or the arm turns; measure or stiffen it.",
     parameters={"amplitude": Parameter(0.005, 1.0, "rad", log=True, low=1e-4, high=0.2)},
     stage=KINEMATICS,
     scatter=_scatter_hand_roll,

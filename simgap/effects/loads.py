@@ -32,10 +32,7 @@ FINGERTIP_MASS = loading(  # outboard of its force sensor
     shows="constant and inertial, free motion too",
     mistaken_for=("force_bias",),
     called="mass beyond the force sensor that the model lacks",
-    check=(
-        "Weigh what is mounted in front of the sensor, or hold the finger still at two heights and in two"
-        " directions."
-    ),
+    check="Weigh what is before the sensor, or hold the finger still at two heights and in two directions.",
     parameters={"mass": Parameter(0.0, 0.012, "kg", low=0.0, high=0.1)},
     stage=HAND,
 )
@@ -48,9 +45,7 @@ VISCOUS_DRAG = loading(
     shows="free motion too, by velocity",
     mistaken_for=("force_lag",),
     called="drag on the fingers as they move",
-    check=(
-        "Move the open hand back and forth at two speeds and watch the forces; look at bearings and sleeves."
-    ),
+    check="Move the open hand to and fro at two speeds and watch the forces; look at bearings and sleeves.",
     parameters={"coefficient": Parameter(0.0, 0.6, "N s/m")},
     stage=HAND,
 )

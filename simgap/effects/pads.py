@@ -97,10 +97,7 @@ FINGERTIP_COMPLIANCE = HandEffect(
     shows="distance follows grip force",
     mistaken_for=("width", "joint_offset", "force_gain"),
     called="other fingertips than the model's",
-    check=(
-        "Press a fingertip against a scale with feeler gauges behind it and plot force over travel; look "
-        "for worn or replaced pads."
-    ),
+    check="Press a fingertip against a scale and plot force over travel; look for worn or replaced pads.",
     phrase=_phrase_fingertip_compliance,
     parameters={
         n: Parameter(0.0, 4e-4, "m/N", low=-2.4e-4 if "normal" in n else -3.8e-4)

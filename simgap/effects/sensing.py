@@ -22,6 +22,7 @@ from simgap.effects.base import (
     Spread,
     Values,
     gradient,
+    middle,
     mixing,
     of_forces,
     own,
@@ -73,9 +74,7 @@ FORCE_DRIFT = of_forces(
     shows="a ramp over the trial, free motion too",
     mistaken_for=("fingertip_creep", "force_bias"),
     called="force sensors whose zero drifts",
-    check=(
-        "Record a minute in free air after switching on; let amplifiers and gauges warm up before a session."
-    ),
+    check="Record a minute in free air after switching on; let amplifiers and gauges warm up first.",
     parameters={c: Parameter(0.0, 0.015, "N/s") for c in FORCE_CHANNELS}
     | {"bend": Parameter(0.0, 0.15, low=-0.6, high=0.6, hidden=True, shape=True)},
     correct=unread(DRIFT, own(DRIFT), _since),
@@ -140,10 +139,7 @@ FORCE_CROSSTALK = mixing(
     shows="shear and net force follow the grip",
     mistaken_for=("sensor_rotation",),
     called="cross-talk between the axes of a force sensor",
-    check=(
-        "Press straight against a wall with one finger and see whether the other axis moves; redo the "
-        "calibration matrix."
-    ),
+    check="Press straight on a wall with one finger: if the other axis moves, redo the calibration matrix.",
     parameters={n: Parameter(0.0, 0.06, low=-0.2, high=0.2) for n in ("fy_from_fx", "fx_from_fy")},
     stage=MIX,
 )
@@ -186,10 +182,7 @@ FORCE_LAG = of_forces(
     shows="every contact change, late",
     mistaken_for=("force_lowpass",),
     called="force readings that come late",
-    check=(
-        "Tap a fingertip sharply and compare the time stamps of force and motion; look for a buffer in "
-        "the force channel."
-    ),
+    check="Tap a fingertip and compare the time stamps of force and motion; look for a buffer of the forces.",
     phrase=_of_fingers("force readings that come late"),
     parameters={
         n: Parameter(
@@ -211,10 +204,7 @@ FORCE_LOWPASS = of_forces(
     shows="rounded contact changes",
     mistaken_for=("force_lag",),
     called="a slow filter in the force channel",
-    check=(
-        "Look up the filter setting of the force amplifier or driver; tap a fingertip and see how fast "
-        "the reading rises."
-    ),
+    check="Look up the filter of the amplifier or driver; tap a fingertip and see how fast readings rise.",
     phrase=_of_fingers("a slow filter in the force channel"),
     parameters={
         n: Parameter(0.0, 0.08, "s", starts=(0.02, 0.06, 0.12, 0.2), low=0.0, high=0.5)
@@ -288,9 +278,8 @@ def _scatter_clock_jitter(given: Any, residual: np.ndarray) -> Any:
 def _clock_rates(given: Any) -> np.ndarray:
     """Whitened change per second of clock error (T, N, C), whose mean over grouped samples counts."""
     world = given.frame.world
-    _, velocity = tips(world)
     step = np.median(np.diff(world.t, axis=1))
-    speed = (velocity[..., :2] + velocity[..., 2:]) / 2
+    speed = middle(tips(world)[1])
     rate = gradient(world.t, speed)
     out = np.zeros_like(given.weight)
     for k, c in enumerate((CHANNELS.index("vx"), CHANNELS.index("vy"))):

@@ -23,9 +23,8 @@ from simgap.gap.problem import (
     columns_of,
     evaluated,
     free_of,
-    limits,
-    neutral,
     residual_at,
+    slots,
     tolerated,
 )
 from simgap.gap.sensor_noise import MEDIAN
@@ -91,11 +90,8 @@ def on_grid(
 
 def scatters(given: Problem, residual: np.ndarray, names: list[str]) -> list[Scatter]:
     """The scatter of each of the named effects in residuals (n,), nuisances included, if there is any."""
-    scattering: list[Callable[..., Scatter | None]] = [
-        e.scatter for n, e in catalogue().items() if n in names and e.scatter is not None
-    ]
-    found = [scatter(given, residual) for scatter in scattering]
-    return [s for s in found if s is not None]
+    known = (e.scatter for n, e in catalogue().items() if n in names and e.scatter is not None)
+    return [s for scatter in known if (s := scatter(given, residual)) is not None]
 
 
 # Level and colour of a recording's noise, estimated where nothing but noise is expected.
@@ -319,7 +315,7 @@ def gap_of(
 
 def _measured(given: Problem, healthy: Fitted) -> list[Candidate]:
     """A candidate for each property that was measured apart."""
-    wrong = [e.wrong for e in catalogue().values() if e.wrong is not None]
+    wrong = (e.wrong for e in catalogue().values() if e.wrong is not None)
     return [c for candidates in wrong for c in candidates(given, healthy.jacobian)]
 
 
@@ -365,7 +361,7 @@ def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
     for key, rest in zip(joint.effects, others, strict=True):
         u = joint.u.copy()
         own = columns_of(given, (key,))[k:]
-        u[own] = neutral(given)[own]
+        u[own] = 0.0
         alone.append(residual_at(given, rest, u)[given.there] - joint.residual)
     both, doubts = (all_of_them - sum(alone)) / len(alone), (joint.doubts - healthy.doubts) / len(alone)
     out, at = [], k
@@ -422,10 +418,10 @@ def _candidate(
     `own` are its columns among the coordinates.
     """
     free, effect = free_of(key), catalogue()[name_of(key)]
-    low, high = (edge[own] for edge in limits(given))
+    low, high = slots(given.num_common)[1][:, own]
     turned = sum(float(p.value(u[c])) for p, c in zip(free, own, strict=True) if p.name == effect.turns)
     return Candidate(
-        effect.name, tuple(p.name for p in free), u[own], neutral(given)[own], np.ones(own.size), shift,
+        effect.name, tuple(p.name for p in free), u[own], np.zeros(own.size), np.ones(own.size), shift,
         -jacobian,
         low, high, evidence=-doubts,
         form=RESPONSE if effect.exact else MODELLED,

@@ -22,7 +22,7 @@ from simgap.attribution.problem import Candidate, Gap
 from simgap.attribution.search import sought, statistic
 from simgap.attribution.verdict import Cell, entries, log_odds, rows
 from simgap.effects import catalogue, effect_named, forms_of, free_parameters, name_of
-from simgap.effects.base import World, tips
+from simgap.effects.base import World, middle, tips
 from simgap.gap.assemble import scatters, together
 from simgap.gap.experiments import next_experiment
 from simgap.gap.frame import CHANNELS, check_forced, of_wrist
@@ -100,9 +100,8 @@ def shifts(given: Problem, causes: Fitted) -> np.ndarray:
 def channels(world: World) -> np.ndarray:
     """Task-space channels (T, N, C) of a world, in the order of CHANNELS."""
     position, velocity = tips(world)
-    mean, apart = (position[..., :2] + position[..., 2:]) / 2, position[..., 2:] - position[..., :2]
-    speed = (velocity[..., :2] + velocity[..., 2:]) / 2
-    return np.concatenate([mean, apart, speed, net_forces(world.force)], -1)
+    apart = position[..., 2:] - position[..., :2]
+    return np.concatenate([middle(position), apart, middle(velocity), net_forces(world.force)], -1)
 
 
 # The attribution as the interface describes it.
@@ -123,33 +122,25 @@ def body(
         following: Entry of the next experiment.
         seed: Of the draws behind intervals.
     """
-    given, posterior = found.problem, verdict.effects
+    given, posterior, far = found.problem, verdict.effects, verdict.how_far
     named = {n: e for n, e in posterior.items() if n in catalogue()}
     ranked = sorted(named, key=lambda n: -named[n].probability)
     shown = [
         n for k, n in enumerate(ranked) if k < LISTED or n in verdict.causes or n in verdict.indistinguishable
     ]
-    effects: dict[str, dict[str, Any]] = {
-        n: {
-            "parameters": parameters(found, posterior[n], n, seed),
-            "log_evidence": log_odds([posterior[n].probability]),
-            "heldout_score": None,
-            "property_shift": {},
-        }
-        for n in shown
-    }
+
+    def entry(names: tuple[str, ...], parameters: dict[str, Any]) -> dict[str, Any]:
+        odds = log_odds(posterior[n].probability for n in names)
+        score = None if far is None or len(names) < 2 else far.score
+        shift = _shifts(found, causes) if names == verdict.causes else {}
+        return {"parameters": parameters, "log_evidence": odds, "heldout_score": score,
+                "property_shift": shift}  # fmt: skip
+
+    effects = {n: entry((n,), parameters(found, posterior[n], n, seed)) for n in shown}
     if len(verdict.causes) > 1:
-        effects["+".join(verdict.causes)] = {
-            "parameters": {
-                f"{n}.{k}": p for n in verdict.causes for k, p in effects[n]["parameters"].items()
-            },
-            "log_evidence": log_odds(verdict.effects[n].probability for n in verdict.causes),
-            "heldout_score": None if verdict.how_far is None else verdict.how_far.score,
-            "property_shift": _shifts(found, causes),
-        }
-    elif verdict.causes and causes is not None:
-        effects[verdict.causes[0]]["property_shift"] = _shifts(found, causes)
-    rest, far = verdict.remainder, verdict.how_far
+        own = {f"{n}.{k}": p for n in verdict.causes for k, p in effects[n]["parameters"].items()}
+        effects["+".join(verdict.causes)] = entry(verdict.causes, own)
+    rest = verdict.remainder
     attribution = {n: (e.probability, e.share, e.share_90) for n, e in named.items()}
     out = entries(verdict, verdict.detection, (rest.share, rest.p_value, where(given, rest.where, None)),
                   attribution, where(given, verdict.where, causes))  # fmt: skip
@@ -279,14 +270,10 @@ class Diagnosis(Tabled):
         """
         from estimation.report import inference_data
 
-        every = {
-            f"{name}.{key}": values[None]
-            for name in self.body["effects"]
-            if name in self.attribution.effects
-            for key, (values, _) in drawn(
-                self.search, self.attribution.effects[name], name, self.seed
-            ).items()
-        }
+        every, posterior = dict[str, np.ndarray](), self.attribution.effects
+        for name in (name for name in self.body["effects"] if name in posterior):
+            draws = drawn(self.search, posterior[name], name, self.seed)
+            every |= {f"{name}.{key}": values[None] for key, (values, _) in draws.items()}
         return inference_data(every)
 
     def plot_where(self, path: str | Path | None = None) -> Axes:
@@ -371,11 +358,8 @@ def healthy_statistics(found: Search, healthy: AlignedTrials, actual: Actual | N
 def _inseparable(verdict: Attribution, following: dict[str, Any] | None) -> list[str]:
     """A warning that names effects that no listed experiment is expected to separate from the causes."""
     left = sorted(set(verdict.indistinguishable) - set([] if following is None else following["separates"]))
-    if not left:
-        return []
-    return [
-        f"no experiment listed is expected to separate {', '.join(left)} from {' + '.join(verdict.causes)}"
-    ]
+    text = f"no experiment listed is expected to separate {', '.join(left)} from {' + '.join(verdict.causes)}"
+    return [text] if left else []
 
 
 def attributed(

@@ -13,7 +13,7 @@ from hmmseg.contact.decompose import FREE, Subtask, height_equations
 from hmmseg.errors import InputError
 from hmmseg.hand.kinematics import forward, joint_velocity, tip_velocity
 from hmmseg.hand.signals import Signals, group_size, grouped, task_space
-from hmmseg.io.rig import FORCE_CHANNELS, Finger, Rig
+from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Finger, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
@@ -125,8 +125,8 @@ def without_dropouts(trial: Trial) -> Trial:
     return replace(trial, channels=channels)
 
 
-def thinned(trial: Trial, rig: Rig, rate: float = MAX_RATE) -> tuple[Trial, int]:
-    """Average a trial down to a `rate` [Hz] at most.
+def thinned(trial: Trial, rig: Rig) -> tuple[Trial, int]:
+    """Average a trial down to MAX_RATE at most.
 
     Lost readings are left out. Angles and rates are those of the tips' mean positions and velocities, as a
     fast finger is not where its mean angles are.
@@ -135,16 +135,15 @@ def thinned(trial: Trial, rig: Rig, rate: float = MAX_RATE) -> tuple[Trial, int]
         The trial, and the number of samples averaged into one.
     """
     trial = without_dropouts(trial)
-    group = group_size(trial.rate, rate)
+    group = group_size(trial.rate, MAX_RATE)
     if group <= 1:
         return trial, 1
     inertia = None if trial.inertia is None else grouped(trial.inertia, group)[0]
     channels = {k: grouped(v, group)[0] for k, v in trial.channels.items()}
     for number in (1, 2) if rig.jointed else ():
         channels |= _of_mean_tip(trial, channels, rig.finger(number), number, group)
-    return Trial(
-        trial.file, grouped(trial.t, group)[0], channels, hidden=trial.hidden, inertia=inertia
-    ), group
+    t = grouped(trial.t, group)[0]
+    return Trial(trial.file, t, channels, hidden=trial.hidden, inertia=inertia), group
 
 
 def _of_mean_tip(
@@ -184,12 +183,10 @@ def trial_arrays(
     free, carry = phase == Phase.FREE, phase == Phase.CARRY
     edge = np.abs(t[:, None] - boundaries).min(axis=1) < step
     force = np.stack([signals.__dict__[c] for c in FORCE_CHANNELS], 1)
-    names = ("q11", "q12", "q21", "q22") if rig.jointed else ("x1", "y1", "x2", "y2")
+    names = JOINTS if rig.jointed else ("x1", "y1", "x2", "y2")
     joints = np.stack([trial.channels[n] for n in names], 1)
-    if rig.jointed:
-        rates = np.stack([trial.channels[f"d{n}"] for n in names], 1)
-    else:
-        rates = np.stack([signals.vx1, signals.vy1, signals.vx2, signals.vy2], 1)
+    speeds = trial.channels if rig.jointed else signals.__dict__
+    rates = np.stack([speeds[f"d{n}" if rig.jointed else f"v{n}"] for n in names], 1)
     there = _there(t, phase, *(np.asarray(np.isfinite(z).all(1)) for z in (force, joints, rates)))
     force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
     sample = sample_noise(signals, group)
@@ -332,20 +329,9 @@ def _there(
     both[1:-1] &= (place & speed)[2:] & (place & speed)[:-2]
     near = speed.copy()
     near[1:-1] &= speed[2:] & speed[:-2]
-    inertial = force & near
-    columns = {
-        "x": still & force & place,
-        "y": (still | (phase == Phase.SLIDE)) & force & place,
-        "distance": held & force & place,
-        "offset": held & force & place,
-        "vx": both,
-        "vy": both,
-        "fx": (free & force) | (carry & inertial),
-        "fy": (free & force) | (carry & inertial),
-        "grip": free & force,
-        "shear": free & force,
-    }
-    return np.stack([columns[c] for c in CHANNELS], 1).astype(float)
+    slid, seen, net = still | (phase == Phase.SLIDE), force & place, force & (free | (carry & near))
+    x, y, apart, open_ = still & seen, slid & seen, held & seen, free & force
+    return np.stack([x, y, apart, apart, both, both, net, net, open_, open_], 1).astype(float)
 
 
 class Arrays(NamedTuple):
@@ -481,13 +467,11 @@ def _stacked(rows: list[np.ndarray], length: int) -> np.ndarray:
 
 
 def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:
-    pad, zero = rig.fingertip, np.zeros(())
+    pad, phase = rig.fingertip, stack["phase"]
     base, length = np.zeros(4), np.zeros(4)
     if rig.jointed:
         base = np.array([*rig.finger(1).base, *rig.finger(2).base])
         length = np.array([*rig.finger(1).links, *rig.finger(2).links])
-    phase = stack["phase"]
-    carry = phase[..., Phase.CARRY]
     return World(
         t=stack["t"],
         joints=stack["joints"],
@@ -498,24 +482,11 @@ def _world(stack: dict[str, np.ndarray], events: np.ndarray, rig: Rig) -> World:
         length=length,
         jointed=np.asarray(float(rig.jointed)),
         gravity=np.asarray(rig.gravity),
-        link=np.ones(4),
         give_normal=np.full(2, 1 / pad.normal_stiffness),
         give_shear=np.full(2, 1 / pad.shear_stiffness),
-        delay=np.zeros(4),
-        smoothing=np.zeros(4),
-        creep=zero,
-        creep_time=np.ones(()),
-        tilt=zero,
-        give_support=zero,
-        support_time=zero,
-        inertia=np.ones(()),
-        couple=zero,
-        loudness=np.ones_like(stack["force"]),
-        ring=np.array([1.0, 0.05, 0.0]),
-        slip=np.zeros_like(carry),
-        modes=np.zeros(6),
+        slip=np.zeros_like(stack["t"]),
         free=phase[..., Phase.FREE],
         ground=phase[..., Phase.PICKUP] + phase[..., Phase.PLACE] + phase[..., Phase.SLIDE],
-        carry=carry,
+        carry=phase[..., Phase.CARRY],
         events=events,
     )

@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from simgap.effects.base import gradient, tips, with_load
+from simgap.effects import catalogue
+from simgap.effects.base import gradient, middle, tips, with_load
 from simgap.gap.frame import CHANNELS
-from simgap.gap.problem import Nuisances, Problem, derivatives, free_of, neutral, residual_of, slots
+from simgap.gap.problem import Nuisances, Problem, fit, free_of, neutral, residual_of, slots
 from simgap.phases import Phase
 
 SWING = 2e-3  # prior: rad; sd of the angle of a lifted block relative to how it stood
@@ -27,21 +28,17 @@ def with_nuisances(given: Problem) -> Problem:
     Their number depends only on trials, grips and rig. A column of zeros is kept, as with additional noise on
     the recordings it may not be zero (`simgap.gap.assemble`).
     """
-    columns = [
-        *_admitted(given), *_inertial(given), *_late_rates(given), *_settling(given),
-    ]  # fmt: skip
+    columns = [*_admitted(given), *_inertial(given), *_late_rates(given), *_settling(given)]
     return replace(given, nuisances=Nuisances(np.concatenate(columns, 1)))
 
 
 def _admitted(given: Problem) -> list[np.ndarray]:
     """Columns (n, .) of what rig.toml admits under [systematic]."""
-    out, k, u = [], given.num_common, neutral(given)
-    for slot in slots(k)[0]:
-        if slot.effect.admitted is None:
-            continue
-        key, sds = slot.effect.admitted(given.frame.rig)
+    out, k = [], given.num_common
+    for admitted in (catalogue()[name].admitted for name in slots(k)[0]):
+        key, sds = ("", {}) if admitted is None else admitted(given.frame.rig)
         if any(sds.values()):
-            jacobian = derivatives(given, (key,), u)[:, k:]
+            jacobian = fit(given, (key,), neutral(given), steps=0).jacobian[:, k:]
             for j, p in enumerate(free_of(key)):
                 if sds.get(p.name, 0.0) > 0:
                     out.append(-jacobian[:, [j]] * sds[p.name] / p.sd)
@@ -67,18 +64,14 @@ def _late_rates(given: Problem) -> list[np.ndarray]:
     """
     world, weight = given.frame.world, given.weight
     step = float(np.median(np.diff(world.t[0])))
-    velocity = tips(world)[1]
-    mean = (velocity[..., :2] + velocity[..., 2:]) / 2
-    position = tips(world)[0]
-    place = (position[..., :2] + position[..., 2:]) / 2
+    place, mean = map(middle, tips(world))
     # From the quieter of the two: a column with the residual's own noise would be fitted to smooth it.
     calm = _quieter(mean, gradient(world.t, place))
     rate = gradient(world.t, calm)
     bend = gradient(world.t, rate)
     # The velocity of a drive that differentiates its own readings from sample to sample.
     before = np.concatenate([world.joints[:, :1], world.joints[:, :-1]], 1)
-    own = tips(world._replace(rates=(world.joints - before) / step))[1]
-    own = (own[..., :2] + own[..., 2:]) / 2
+    own = middle(tips(world._replace(rates=(world.joints - before) / step))[1])
     own[:, 1:-1] = (own[:, :-2] + 4 * own[:, 1:-1] + own[:, 2:]) / 6
     own = own - gradient(world.t, place)
     out = []
@@ -102,9 +95,7 @@ def _quieter(speed: np.ndarray, difference: np.ndarray) -> np.ndarray:
 
 def _settling(given: Problem) -> list[np.ndarray]:
     """Columns (n, 1) for each grip: the angle of the lifted block relative to how it stood, and the slip of
-    pads in
-
-    the shock of setting it down.
+    pads in the shock of setting it down.
     """
     arrays, out = given.frame.arrays, []
     width = np.einsum("tnm,mo,o->tn", arrays.onehot, arrays.objects, given.centre[:, 1])

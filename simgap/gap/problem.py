@@ -15,7 +15,7 @@ from hmmseg.contact.decompose import PROPERTIES
 from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.effects import catalogue, free_parameters, name_of
-from simgap.effects.base import HandEffect, World, turning_compliance
+from simgap.effects.base import World, turning_compliance
 from simgap.gap.frame import CHANNELS, Frame
 from simgap.gap.residuals import STANCES, contact, residuals
 
@@ -52,23 +52,16 @@ class Nuisances:
 MEASURED = (2e-3, 3e-5, 4e-5)
 
 
-@dataclass(frozen=True)
-class Slot:
-    """One effect and its first column among those of all parameters."""
-
-    effect: HandEffect
-    start: int
-
-
 @lru_cache
-def slots(num_common: int) -> tuple[tuple[Slot, ...], int]:
-    """Slots of all deterministic effects in order of correction, and the number of columns."""
-    out, at = [], num_common
-    known = [e for e in catalogue().values() if e.correct is not None]
-    for effect in sorted(known, key=lambda e: (e.stage, e.name)):
-        out.append(Slot(effect, at))
-        at += len(effect.parameters)
-    return tuple(out), at
+def slots(num_common: int) -> tuple[dict[str, int], np.ndarray]:
+    """First column of each deterministic effect, in order of correction, and the limits (2, U) of all."""
+    known = sorted((e.stage, e.name) for e in catalogue().values() if e.correct is not None)
+    starts, ends = dict[str, int](), [(-np.inf, np.inf)] * (num_common - len(STANCES))
+    ends += [(0.0, np.inf)] * len(STANCES)  # blocks turn towards a moment
+    for _, name in known:
+        starts[name] = len(ends)
+        ends += [p.limits for p in catalogue()[name].parameters.values()]
+    return starts, np.array(ends).T
 
 
 @dataclass(frozen=True)
@@ -89,10 +82,6 @@ class Problem:
     sd: np.ndarray
     measured: np.ndarray
     nuisances: Nuisances
-
-    def product(self, a: np.ndarray, b: np.ndarray) -> Any:
-        """Products of residuals or of their derivatives (n, ...), nuisances integrated out."""
-        return self.nuisances.product(a, b) if self.nuisances.columns.size else a.T @ b
 
     def properties(self, u: np.ndarray) -> np.ndarray:
         """Weight, width and height (O, 3) of the blocks at coordinates (all columns)."""
@@ -162,34 +151,16 @@ def free_of(key: str) -> list[Parameter]:
 
 def neutral(given: Problem) -> np.ndarray:
     """Coordinates of no effect, with properties at the centre of their prior."""
-    places, total = slots(given.num_common)
-    u = np.zeros(total)
-    for slot in places:
-        for j, p in enumerate(slot.effect.parameters.values()):
-            if not p.log:
-                u[slot.start + j] = p.coordinate(p.nominal)
-    return u
+    return np.zeros(slots(given.num_common)[1].shape[1])
 
 
 def columns_of(given: Problem, effects: Sequence[str]) -> np.ndarray:
     """Columns of the properties and of the free parameters of effects' forms."""
-    out = [np.arange(given.num_common)]
-    places = {s.effect.name: s for s in slots(given.num_common)[0]}
+    starts, out = slots(given.num_common)[0], [*range(given.num_common)]
     for key in effects:
-        slot, names = places[name_of(key)], free_parameters(key)
-        out.append(np.array([slot.start + j for j, n in enumerate(slot.effect.parameters) if n in names]))
-    return np.concatenate(out).astype(int)
-
-
-def limits(given: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of all coordinates."""
-    places, total = slots(given.num_common)
-    low, high = np.full(total, -np.inf), np.full(total, np.inf)
-    low[given.centre.size : given.num_common] = 0.0  # blocks turn towards a moment
-    for slot in places:
-        for j, p in enumerate(slot.effect.parameters.values()):
-            low[slot.start + j], high[slot.start + j] = p.limits
-    return low, high
+        every, free = enumerate(catalogue()[name_of(key)].parameters), free_parameters(key)
+        out += [starts[name_of(key)] + j for j, name in every if name in free]
+    return np.array(out, int)
 
 
 # The smallest gap that matters: [tolerance] of rig.toml, or what its sensors could not show.
@@ -237,11 +208,11 @@ STEP = 1e-5  # numerics: step of finite differences, in prior standard deviation
 def _without_effects(given: Problem, effects: Sequence[str], u: np.ndarray) -> World:
     """The recorded world corrected for effects at coordinates u (all columns)."""
     world, names = given.frame.world, {name_of(key) for key in effects}
-    for slot in slots(given.num_common)[0]:
-        if slot.effect.name in names:
-            each = enumerate(slot.effect.parameters.values())
-            values = {p.name: p.value(u[slot.start + j]) for j, p in each}
-            world = slot.effect.correct(world, values, 1.0)  # type: ignore[misc]
+    for name, start in slots(given.num_common)[0].items():
+        if name in names:
+            effect = catalogue()[name]
+            values = {n: p.value(u[start + j]) for j, (n, p) in enumerate(effect.parameters.items())}
+            world = effect.correct(world, values, 1.0)  # type: ignore[misc]
     return world
 
 
@@ -321,7 +292,7 @@ def cost_at(
     """
     left, doubts = whitened(given, _without_effects(given, effects, u), u)
     left, own = left[given.there], u[mine[: given.num_common]]
-    cost = 0.5 * float(given.product(left, left)) + doubts + 0.5 * float(own @ own)
+    cost = 0.5 * float(given.nuisances.product(left, left)) + doubts + 0.5 * float(own @ own)
     for block in blocks:
         x = u[mine[block]]
         cost += 0.5 * (1 + block.size) * float(np.log1p(x @ x))
@@ -363,12 +334,6 @@ def evaluated(
     return Fitted(effects, u, mine, at[0], jacobian, at[1], doubt_slope, at[2])
 
 
-def derivatives(given: Problem, effects: Sequence[str], u: np.ndarray) -> np.ndarray:
-    """Derivatives (n, K) of a candidate's whitened residuals by its free columns, at coordinates u."""
-    effects, mine = tuple(effects), columns_of(given, effects)
-    return evaluated(given, effects, u, mine).jacobian
-
-
 # Joint fits of properties and effects.
 
 STEPS = 12  # numerics: most iterations
@@ -394,7 +359,7 @@ def fit(
         usual: Known derivatives (n, P) with respect to the properties (`evaluated`).
     """
     mine = columns_of(given, effects)
-    low, high = (edge[mine] for edge in limits(given))
+    low, high = slots(given.num_common)[1][:, mine]
     u = u.copy()
     u[mine] = np.clip(u[mine], low, high)
     blocks, at = [], given.num_common
@@ -408,8 +373,8 @@ def fit(
         for block in blocks:
             x = u[mine[block]]
             prior[block] = (1 + block.size) / (1 + x @ x)
-        slope = given.product(now.jacobian, now.residual) + now.doubt_slope + prior * u[mine]
-        curvature = given.product(now.jacobian, now.jacobian) + np.diag(prior)
+        slope = given.nuisances.product(now.jacobian, now.residual) + now.doubt_slope + prior * u[mine]
+        curvature = given.nuisances.product(now.jacobian, now.jacobian) + np.diag(prior)
         damped = curvature + damping * np.diag(np.diag(curvature))
         step, _ = least(damped, -slope, low - u[mine], high - u[mine])
         trial = u.copy()

@@ -22,6 +22,7 @@ from simgap.effects.base import (
     DeadBand,
     World,
     gradient,
+    middle,
     swung,
     tips,
 )
@@ -353,7 +354,7 @@ def residuals(
     unseen -= float(np.log(wider[there[..., OFFSET] > 0]).sum())
 
     acceleration, _ = fivepoint(world, velocity)
-    ax, ay = ((acceleration[..., k] + acceleration[..., k + 2]) / 2 for k in (0, 1))
+    ax, ay = np.moveaxis(middle(acceleration), -1, 0)
     mass = weight / world.gravity * world.inertia
     ground, carry = world.ground, world.carry
     net_x = carry * mass * ax + ground * (force[..., 0] + force[..., 2])
@@ -366,9 +367,7 @@ def residuals(
         filtered = driven(world, filtered, back=False)
     forces = (net_forces(world.force) - filtered) * world.loudness
 
-    mean_p = (position[..., :2] + position[..., 2:]) / 2
-    mean_v = (velocity[..., :2] + velocity[..., 2:]) / 2
-    speeds = _compact(mean_v) - gradient(world.t, mean_p)
+    speeds = _compact(middle(velocity)) - gradient(world.t, middle(position))
     # In recorded units: an effect must not gain by scaling the noise down.
     size = np.mean(world.link)
     return (

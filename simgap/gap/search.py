@@ -14,7 +14,6 @@ from hmmseg.contact.decompose import PROPERTIES
 from hmmseg.errors import InputError
 from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import Rig
-from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import AlignedTrials, align
 from simgap.attribution.problem import Gap
 from simgap.bounded import least
@@ -31,9 +30,9 @@ from simgap.gap.problem import (
     evaluated,
     fit,
     free_of,
-    limits,
     neutral,
     problem,
+    slots,
     world_without,
 )
 from simgap.gap.residuals import SURE
@@ -61,7 +60,7 @@ def shifting(names: Sequence[str]) -> list[str]:
 def _gridded(given: Problem, key: str) -> list[tuple[int, Parameter]]:
     """Columns and parameters of an effect's form that are started from every point of a grid."""
     own = columns_of(given, (key,))[given.num_common :]
-    return [(int(c), p) for c, p in zip(own, free_of(key), strict=True) if p.gridded]
+    return [(int(c), p) for c, p in zip(own, free_of(key), strict=True) if p.starts]
 
 
 def starts(given: Problem, key: str, base: np.ndarray) -> list[np.ndarray]:
@@ -108,19 +107,19 @@ def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
 def _linear_step(given: Problem, key: str, start: np.ndarray, usual: np.ndarray) -> tuple[float, np.ndarray]:
     """Cost after one linear step of all but an effect's gridded parameters, and the coordinates there."""
     fixed = [column for column, _ in _gridded(given, key)]
-    low, high = limits(given)
+    low, high = slots(given.num_common)[1]
     columns = np.array([c for c in columns_of(given, (key,)) if c not in fixed])
     u = start.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
     now = evaluated(given, (key,), u, columns, usual)
-    curvature = given.product(now.jacobian, now.jacobian) + np.eye(columns.size)
-    pull = -given.product(now.jacobian, now.residual) - u[columns]
+    curvature = given.nuisances.product(now.jacobian, now.jacobian) + np.eye(columns.size)
+    pull = -given.nuisances.product(now.jacobian, now.residual) - u[columns]
     step, _ = least(curvature, pull, low[columns] - u[columns], high[columns] - u[columns])
     there = u.copy()
     there[columns] = np.clip(u[columns] + step, low[columns], high[columns])
     left = now.residual + now.jacobian @ (there[columns] - u[columns])
     own = there[: given.num_common]
-    cost = 0.5 * float(given.product(left, left)) + now.doubts + 0.5 * float(own @ own)
+    cost = 0.5 * float(given.nuisances.product(left, left)) + now.doubts + 0.5 * float(own @ own)
     return cost, there
 
 
@@ -145,11 +144,8 @@ def realigned(aligned: AlignedTrials, given: Problem, found: Fitted, all_fit: bo
 
 def _hand(rig: Rig, world: World) -> Rig:
     """The rig with the pads that the candidate gives it."""
-    give = {
-        "normal_stiffness": float(np.mean(world.give_normal)),
-        "shear_stiffness": float(np.mean(world.give_shear)),
-    }
-    pads = {k: 1 / v for k, v in give.items() if v > 1e-7}
+    give = {"normal": float(np.mean(world.give_normal)), "shear": float(np.mean(world.give_shear))}
+    pads = {f"{k}_stiffness": 1 / v for k, v in give.items() if v > 1e-7}
     return rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
 
 
@@ -184,11 +180,6 @@ class Search:
     redrawn: tuple[Problem, ...]
     identified: Identified
     warnings: tuple[str, ...]
-
-    @property
-    def trials(self) -> list[Trial]:
-        """The recordings that fit their task."""
-        return [one.trial for one in self.aligned.trials]
 
     @property
     def blocks(self) -> tuple[np.ndarray, np.ndarray]:
@@ -235,7 +226,8 @@ def search(
         tell("aligning trials that seem not to fit")
         aligned, misled = _aligned_all(aligned, actual, keys)
     every, aligned = aligned, _complete(aligned)
-    if identified is None and not _all_measured(aligned, actual):
+    known = [(actual or {}).get(name, {}) for name in aligned.task.objects]
+    if identified is None and not all(kind in own for own in known for kind in PROPERTIES):
         tell("identifying properties")
         identified = identify_aligned(aligned).centres
     identified = identified or {}
@@ -253,17 +245,6 @@ def search(
                   identified, (*misled, *warnings))  # fmt: skip
 
 
-def _all_measured(aligned: AlignedTrials, actual: Actual | None) -> bool:
-    """Whether every property was measured apart."""
-    given = actual or {}
-    return all(kind in given.get(name, {}) for name in aligned.task.objects for kind in PROPERTIES)
-
-
-def _shown(aligned: AlignedTrials) -> list[Trial]:
-    """The trials of which no channel is missing throughout."""
-    return [t.trial for t in aligned.trials if all(np.isfinite(v).any() for v in t.trial.channels.values())]
-
-
 def _aligned_all(
     failed: AlignedTrials, actual: Actual | None, keys: Sequence[str]
 ) -> tuple[AlignedTrials, list[str]]:
@@ -272,7 +253,8 @@ def _aligned_all(
     Returns:
         The trials, as they were if no candidate helps, and a warning that names the one that does.
     """
-    shown = _shown(failed)
+    every = [one.trial for one in failed.trials]
+    shown = [t for t in every if all(np.isfinite(v).any() for v in t.channels.values())]
     if not shown:
         return failed, []
     aligned = align(shown, failed.task, failed.rig, all_fit=True)

@@ -17,6 +17,7 @@ from simgap.effects import effect_named
 from simgap.effects.base import Performance
 from simgap.gap.problem import fit
 from simgap.gap.search import Search
+from simgap.world.dynamics import interpolated
 from simgap.world.operator import OperatorSettings
 from simgap.world.properties import Block, Blocks
 from simgap.world.simulate import SimulatedTrial, record, simulate_trials
@@ -66,28 +67,17 @@ def recorded(simulated: SimulatedTrial, task: BlockTask, rig: Rig, effects: Valu
         effects: Parameters of each effect.
     """
     rng = np.random.default_rng([simulated.seed, 7])
-    motion = simulated.motion
-    truth = Performance(
-        simulated.t,
-        motion.position,
-        motion.velocity,
-        motion.force,
-        simulated.boundaries,
-        rig,
-        *carried(simulated.t, simulated.boundaries, task, simulated.blocks),
-    )
+    when, ends = simulated.t, simulated.boundaries
+    held = carried(when, ends, task, simulated.blocks)
+    truth = Performance(when, *simulated.motion[:3], ends, rig, *held)
     chosen = [effect_named(n) for n in effects]
     truth = altered(truth, effects, rng)
     t = times = simulated.trial.t
     for effect in chosen:
         if effect.sampled is not None:
             times = effect.sampled(times, dict(effects[effect.name]), rng)
-
-    def at(values: np.ndarray) -> np.ndarray:
-        columns = [np.interp(times, truth.t, c) for c in values.reshape(-1, 4).T]
-        return np.stack(columns, 1).reshape(-1, 2, 2)
-
-    trial = record(t, at(truth.position), at(truth.velocity), at(truth.force), rig, rng, simulated.trial.file)
+    place, speed, force = (interpolated(times, truth.t, z) for z in truth[1:4])
+    trial = record(t, place, speed, force, rig, rng, simulated.trial.file)
     for effect in chosen:
         if effect.finish is not None:
             finish, values = effect.finish, dict(effects[effect.name])

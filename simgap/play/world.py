@@ -47,8 +47,8 @@ def effect_values(name: str, given: Mapping[str, float] | None = None) -> dict[s
 def scene_with(effects: Values, rig: Rig, blocks: Blocks) -> tuple[Rig, Blocks, Surroundings]:
     """Rig, blocks and surroundings under the scene effects among these, with pads stiff enough to play."""
     hand, around, blocks = scene_of(rig, blocks, effects)
-    stiff = {n: getattr(hand.fingertip, n) for n in ("normal_stiffness", "shear_stiffness")}
-    pads = {n: float(np.clip(v, SOFTEST, finite_stiffness(np.inf))) for n, v in stiff.items()}
+    stiff = hand.fingertip.model_dump().items()
+    pads = {n: float(np.clip(v, SOFTEST, finite_stiffness(np.inf))) for n, v in stiff}
     hand = hand.model_copy(update={"fingertip": hand.fingertip.model_copy(update=pads)})
     return hand, {n: replace(b, friction=max(b.friction, SLIPPIEST)) for n, b in blocks.items()}, around
 

@@ -63,26 +63,22 @@ def draw_heat_map(body: Body, subtasks: Sequence[str], path: Path | None = None)
 
 def draw_suspects(body: Body, path: Path | None = None) -> Axes:
     """Probability that each suspect acts, and the share of the gap it explains; else the verdict's sets."""
-    effects = body.get("attribution")
-    if effects:
-        known = chances(body)
-        rows = sorted(effects.items(), key=lambda item: -known[item[0]])[:8][::-1]
-        values = [known[name] for name, _ in rows]
-    else:
-        rows = sorted(body["probabilities"].items(), key=lambda item: -item[1])[:8][::-1]
-        values = [v for _, v in rows]
-    at = np.arange(len(rows))
+    effects = body.get("attribution") or {}
+    known = chances(body) if effects else body["probabilities"]
+    names = sorted(effects or known, key=lambda name: -known[name])[:8][::-1]
+    at = np.arange(len(names))
     with canvas(path, height=2.6) as figure:
         axes = figure.add_subplot()
-        axes.barh(at, values, 0.6, color=BLUE, alpha=0.85, label="probability that it acts")
-        for k, (_, entry) in enumerate(rows):
-            share = entry.get("share") if effects else None
+        chance = [known[name] for name in names]
+        axes.barh(at, chance, 0.6, color=BLUE, alpha=0.85, label="probability that it acts")
+        for k, entry in enumerate(effects.get(name, {}) for name in names):
+            share = entry.get("share")
             if share is not None and entry["probability"] >= 0.01:
                 ends = entry.get("interval_90") or (share, share)
                 axes.plot(ends, [k, k], color=RED, lw=1.4)
-                label = "share of the gap" if k == len(rows) - 1 else None
+                label = "share of the gap" if k == len(names) - 1 else None
                 axes.plot(share, k, "o", color=RED, ms=4, label=label)
-        axes.set_yticks(at, [plain_name(name) for name, _ in rows])
+        axes.set_yticks(at, [*map(plain_name, names)])
         axes.set(xlim=(0, 1.02))
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return axes

@@ -241,8 +241,8 @@ def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
 
 def explained(body: Body) -> str:
     """Share of the gap that the causes explain, if the body has it."""
-    parts = [(n, body.get("attribution", {}).get(n)) for n in body["causes"]]
-    known = [(n, a) for n, a in parts if a and a.get("share") is not None]
+    parts = body.get("attribution", {})
+    known = [(n, parts[n]) for n in body["causes"] if parts.get(n, {}).get("share") is not None]
     if not known:
         return ""
     if len(known) == 1:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from pydantic import BaseModel
 from scipy.stats import norm
 
@@ -110,11 +111,9 @@ def motion_csv(
     log: Recording, commands: Sequence[str], own: Mapping[str, Own], time: tuple[str, float]
 ) -> str:
     """The commands of a motion as CSV in the columns' own units; `time`: its column and unit [s]."""
-    columns = [(log.t - log.t[0]) / time[1]]
-    columns += [own[n].of(log[n]) if n in own else log[n] for n in commands]
-    lines = [",".join((time[0], *commands))]
-    lines += [",".join(f"{v:.9g}" for v in row) for row in zip(*columns, strict=True)]
-    return "\n".join(lines) + "\n"
+    columns = {time[0]: (log.t - log.t[0]) / time[1]}
+    columns |= {n: own[n].of(log[n]) if n in own else log[n] for n in commands}
+    return pd.DataFrame(columns).to_csv(index=False, float_format="%.9g", lineterminator="\n")
 
 
 def intervals(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -1,6 +1,6 @@
 """Animation of fingers and blocks beside their force traces, as a GIF or an MP4."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,12 +25,8 @@ PAD = (0.003, 0.008)  # numerics: m; drawn width and height of a fingertip
 WRITERS = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
 
-@dataclass(frozen=True)
-class Trace:
-    """One panel of forces over time: its label and curves (name, t [s], values)."""
-
-    label: str
-    curves: Sequence[tuple[str, np.ndarray, np.ndarray]]
+# Panels of forces over time by label, each of curves (t [s], values) by name.
+Traces = Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]]
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,7 @@ class Scene:
     rig: Rig
 
 
-def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
+def animate(path: Path, scene: Scene, traces: Traces) -> None:
     """Write the animation to `path`, in real time; InputError for another suffix or without ffmpeg."""
     if path.suffix not in WRITERS:
         raise InputError(str(path), f"unknown kind of animation {path.suffix!r}", " or ".join(WRITERS))
@@ -51,7 +47,7 @@ def animate(path: Path, scene: Scene, traces: Sequence[Trace]) -> None:
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=SIZE, layout="constrained")
         stage, *panels = figure.subplot_mosaic(
-            [["scene", str(k)] for k in range(len(traces))], width_ratios=(1.0, 1.0)
+            [["scene", label] for label in traces], width_ratios=(1.0, 1.0)
         ).values()
         bodies, pads, links = _draw_scene(stage, scene)
         clock = stage.text(0.02, 0.97, "", transform=stage.transAxes, va="top")
@@ -118,17 +114,16 @@ def _joints(scene: Scene) -> list[np.ndarray]:
     return chains
 
 
-def _draw_traces(panels: Sequence[Axes], scene: Scene, traces: Sequence[Trace]) -> list[Line2D]:
+def _draw_traces(panels: Sequence[Axes], scene: Scene, traces: Traces) -> list[Line2D]:
     """Draw all traces; the lines that mark the current time."""
     cursors = []
-    for panel, trace in zip(panels, traces, strict=True):
-        for k, (name, t, values) in enumerate(trace.curves):
-            panel.plot(t, values, color=(INK, BLUE)[k % 2], lw=0.9, label=name or None)
-        panel.set(xlim=(scene.t[0], scene.t[-1]), ylabel=trace.label)
+    for panel, (label, curves) in zip(panels, traces.items(), strict=True):
+        for k, (name, curve) in enumerate(curves.items()):
+            panel.plot(*curve, color=(INK, BLUE)[k % 2], lw=0.9, label=name or None)
+        panel.set(xlim=(scene.t[0], scene.t[-1]), ylabel=label)
         cursors.append(panel.axvline(scene.t[0], color=GREY, lw=0.8))
-        if trace is not traces[-1]:
-            panel.tick_params(labelbottom=False)
-    if any(name for name, _, _ in traces[0].curves):
+        panel.tick_params(labelbottom=panel is panels[-1])
+    if panels[0].get_legend_handles_labels()[1]:
         panels[0].set_ylim(top=1.45 * panels[0].get_ylim()[1])  # room for the legend
         panels[0].legend(loc="upper right", ncols=2)
     panels[-1].set_xlabel("Time [s]")

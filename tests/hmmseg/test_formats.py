@@ -36,8 +36,9 @@ from hmmseg.io.formats import kind_of, parts_of, read_table, split_part
 from hmmseg.io.formats.logs import interpolated
 from hmmseg.io.rig import parse_rig
 from hmmseg.io.task import SequenceTask
+from hmmseg.io.trial import Trial
 from hmmseg.segmentation.spans import Span
-from hmmseg_cli.labels import ADDED, label, lerobot_files
+from hmmseg_cli.labels import ADDED, label, lerobot_files, write_table
 from hmmseg_cli.labels import write_mcap as write_topic
 from hmmseg_cli.main import main
 
@@ -160,17 +161,20 @@ def test_stamps_since_1970_in_another_unit_are_refused_in_any_recording(tmp_path
         refused(rf"a\.csv: column t: is {line}", read_trial, tmp_path / "a.csv", task=task)
 
 
-def test_interpolation_and_labels_by_hand():
+def test_interpolation_and_labels_by_hand(tmp_path):
     ticks = np.array([0, 5, 10, 15, 20, 100, 110])
     values, marked = interpolated(ticks, np.array([0, 10, 20, 110]), np.array([0.0, 1.0, 4.0, 5.0]))
     np.testing.assert_allclose(values, [0.0, 0.5, 1.0, 2.5, 4.0, np.nan, 5.0])
     assert marked.tolist() == [False, True, False, True, False, False, False]
     t = np.array([-0.1, 0.0, 0.1, 0.2, 0.25, 0.3, 0.35, 0.5, 0.6, 0.7])
-    found = label(t, SPANS)
-    assert found.index.tolist() == [-1, 0, 0, 0, 1, 1, 1, 2, 2, -1]
-    np.testing.assert_allclose(found.boundary_sd, [np.nan, 0, 0, 0.01, 0.01, 0.01, 0.03, 0.0, 0.0, np.nan])
-    assert found.names("subtask").tolist() == ["", *["reach"] * 3, *["push"] * 3, *["leave"] * 2, ""]
-    assert label(t, ()).index.tolist() == [-1] * 10
+    index, sd = label(t, SPANS)
+    assert index.tolist() == [-1, 0, 0, 0, 1, 1, 1, 2, 2, -1]
+    np.testing.assert_allclose(sd, [np.nan, 0, 0, 0.01, 0.01, 0.01, 0.03, 0.0, 0.0, np.nan])
+    pd.DataFrame({"t": t}).to_csv(tmp_path / "a.csv", index=False)
+    write_table(tmp_path / "b.csv", tmp_path / "a.csv", Trial("a.csv", t, {}), SPANS)
+    names = pd.read_csv(tmp_path / "b.csv", keep_default_na=False)["subtask"].tolist()
+    assert names == ["", *["reach"] * 3, *["push"] * 3, *["leave"] * 2, ""]
+    assert label(t, ())[0].tolist() == [-1] * 10
 
 
 def test_robomimic_demonstrations(tmp_path):

@@ -171,8 +171,8 @@ def test_a_cause_is_named_and_patched(logs, tmp_path):
 
 @pytest.mark.parametrize(("options", "line"), [
     (["--mjcf", "robot.xml"], "--map: missing"),
-    (["--map", "map.toml"], "goes with a MuJoCo model; expected --mjcf XML"),
-    (["--candidate", "joint:a.damping"], "goes with a MuJoCo model"),
+    (["--map", "map.toml"], "--map: goes with a MuJoCo model, --mjcf XML"),
+    (["--candidate", "joint:a.damping"], "--candidate: goes with a MuJoCo model"),
     (["--simulator", "x.py:Y", "--mjcf", "robot.xml"], "--mjcf: does not go with --simulator"),
     (["--simulator", f"{SWING}:Swing", "--rig", "rig.toml"], "--rig: does not go with a simulator"),
     (["--simulator", f"{SWING}:Swing", "--effect", "viscos"], r"is no candidate; expected .*viscous"),
@@ -331,7 +331,7 @@ def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("options", "line"), [
-    (["--history", "h.jsonl"], "--history h.jsonl: goes with a model of a robot; expected --mjcf XML"),
+    (["--history", "h.jsonl"], "--history: goes with a model of a robot, --mjcf XML"),
     (["--simulator", "x.py:Y", "--history", "h.txt"], "unknown kind of file; expected .jsonl"),
     (["--simulator", "x.py:Y", "--rerun", "a.rrd"], "--rerun: needs rerun-sdk; expected pip install"),
 ])  # fmt: skip

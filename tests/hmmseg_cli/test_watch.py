@@ -14,7 +14,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from refusals import refused
@@ -236,7 +235,7 @@ class Deadly(Executor):
         if self.broken:
             future.set_exception(self.error)
         else:
-            future.set_result(SimpleNamespace(segmentation=str(path)))
+            future.set_result((str(path), (), ()))
         return future
 
 
@@ -273,9 +272,9 @@ def test_a_recording_whose_worker_is_killed_is_done_again_or_left_out(error, tim
         yield Deadly("6", deaths, error)
 
     monkeypatch.setattr(batch, "_executor", executor)
-    monkeypatch.setattr(batch, "replace", lambda _, **new: new.get("file") or SimpleNamespace(**new))
+    monkeypatch.setattr(batch, "replace", lambda _, file: file)
     paths, said, done = [Path(f"{i}.csv") for i in range(11)], [], []
     found = list(segment_apart(paths, Path("task"), Path("rig"), 2, None, done.append, said.append))
-    assert [Path(f.segmentation).stem for f in found] == [str(i) for i in range(11) if i not in lost]
+    assert [Path(file).stem for file, *_ in found] == [str(i) for i in range(11) if i not in lost]
     assert sum(done) == 11 and sum("6.csv: the process" in s for s in said) == len(lost)
     assert "once more" in said[0]

@@ -17,12 +17,12 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig
 from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms
-from simgap.effects import effect_named
+from simgap.effects import catalogue, effect_named
 from simgap.gap import diagnose
 from simgap.gap.assemble import gap_of, scatters, together
 from simgap.gap.frame import CHANNELS, build, shown, shown_forms
 from simgap.gap.nuisances import shifted_by, with_nuisances
-from simgap.gap.problem import derivatives, fit, neutral, problem, slots
+from simgap.gap.problem import fit, neutral, problem, slots
 from simgap.gap.search import Search, best_fit, candidate_names, search
 from simgap.gap.simulated import performed
 from simgap.gap.simulated import recorded as read_out
@@ -41,9 +41,8 @@ def read(name):
 
 
 def own(given, found, name):
-    slot = next(s for s in slots(given.num_common)[0] if s.effect.name == name)
-    every = slot.effect.parameters.values()
-    return {p.name: float(p.value(found.u[slot.start + j])) for j, p in enumerate(every)}
+    at, every = slots(given.num_common)[0][name], catalogue()[name].parameters.values()
+    return {p.name: float(p.value(found.u[at + j])) for j, p in enumerate(every)}
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +77,7 @@ def test_what_a_form_or_a_rig_admits_is_its_own_parameter_or_a_nuisance(healthy)
     )
     given = with_nuisances(problem(replace(frame, rig=rig)))
     k = given.num_common
-    push = derivatives(given, ("force_bias",), neutral(given))[:, k:]
+    push = fit(given, ("force_bias",), neutral(given), steps=0).jacobian[:, k:]
     np.testing.assert_allclose(given.nuisances.columns[:, :2], -push[:, [0, 3]] * [0.2, 0.1], rtol=1e-6)
 
 
@@ -151,7 +150,7 @@ def test_a_trial_without_one_of_its_channels_is_left_out(broken):
     if broken == 2:
         refused("trial_01", search, aligned)
     else:
-        assert [t.name for t in search(aligned).trials] == ["trial_02.csv"]
+        assert [a.trial.name for a in search(aligned).aligned.trials] == ["trial_02.csv"]
 
 
 def as_recorded():

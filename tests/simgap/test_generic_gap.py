@@ -29,10 +29,14 @@ def made(seed=1, effects=None, count=6):
     return real, sim, first | second
 
 
+def cut(*given, **more):
+    real, sim, boundaries = made(*given, **more)
+    return align(real, sim, TASK, boundaries=boundaries)
+
+
 @pytest.fixture(scope="module")
 def alike():
-    real, sim, boundaries = made()
-    return layout(align(real, sim, TASK, boundaries=boundaries))
+    return layout(cut())
 
 
 def test_features_have_known_values_and_each_belongs_to_one_channel_or_is_a_duration(alike):
@@ -55,7 +59,7 @@ def test_parts_follow_their_event_and_whitened_rows_have_the_squares_that_are_st
     assert alike.event[0] == 0 and alike.event[1] > 0.2
     squares, stated = [], []
     for seed in range(8):
-        lay = layout(align(*made(seed)[:2], TASK, boundaries=made(seed)[2]))
+        lay = layout(cut(seed))
         features = both(lay)
         gap = gap_of(lay, whitening(scene(lay), *features), *features, ())
         squares.append([(gap.residual**2)[gap.rows.channel == c].sum() for c in range(5)])
@@ -122,19 +126,15 @@ def test_rings_begin_at_their_event_and_are_recovered_with_their_interval():
 
 
 def test_effects_can_be_forced_and_alike_ensembles_are_called_alike():
-    found = [diagnose(align(*made(seed)[:2], TASK, boundaries=made(seed)[2])).body for seed in range(8)]
-    assert sum(body["verdict"] != "none" for body in found) <= 1
-    real, sim, boundaries = made(2, count=4)
-    found = diagnose(align(real, sim, TASK, boundaries=boundaries), forced=["force_bias"])
-    assert found.body["causes"] == ["force_bias"]
-    refused("needs the virtual model or is unknown", diagnose, align(real, sim, TASK, boundaries=boundaries),
-            forced=["grip_slip"])  # fmt: skip
+    assert sum(diagnose(cut(seed)).body["verdict"] != "none" for seed in range(8)) <= 1
+    few = cut(2, count=4)
+    assert diagnose(few, forced=["force_bias"]).body["causes"] == ["force_bias"]
+    refused("needs the virtual model or is unknown", diagnose, few, forced=["grip_slip"])
 
 
 @pytest.mark.parametrize("name", list(PLANTED))
 def test_a_planted_effect_is_named_with_its_parameters(name):
-    real, sim, boundaries = made(5, {name: PLANTED[name]})
-    body = diagnose(align(real, sim, TASK, boundaries=boundaries)).body
+    body = diagnose(cut(5, {name: PLANTED[name]})).body
     assert body["verdict"] in ("named", "set") and name in {*body["causes"], *body["indistinguishable"]}
     assert sum(body["probabilities"].values()) == pytest.approx(1.0)
     best = body["effects"]["+".join(body["causes"])]["parameters"]
@@ -223,8 +223,7 @@ def test_values_of_against_reach_up_to_the_next_option(folder, monkeypatch):
     monkeypatch.setattr("hmmseg_cli.diagnose._against", against)
     given = arguments(folder, "--seed", "1")
     assert main(given) == 0
-    once = taken | {}
-    again = [a for n in given[given.index("--against") + 1 : -2] for a in ("--against", n)]
+    once, again = taken | {}, [a for n in given[given.index("--against") + 1 : -2] for a in ("--against", n)]
     assert main([*given[: given.index("--against")], *again]) == 0
     assert once == taken and len(once["sim"]) == len(once["real"]) == 5
 
@@ -233,9 +232,9 @@ def test_columns_of_a_plain_task_are_those_that_the_rig_maps(folder, tmp_path):
     for path in [*folder.glob("real_*.csv"), *folder.glob("sim_*.csv")]:
         pd.read_csv(path).rename(columns={"t": "stamp"}).to_csv(path, index=False)
     (folder / "columns.toml").write_text('[columns]\nt = {from = "stamp"}\n')
-    out = tmp_path / "out.json"
-    args = arguments(folder, "--rig", str(folder / "columns.toml"), "--json", str(out), "--quiet")
-    assert main(args) == 0 and json.loads(out.read_text())["causes"] == ["force_bias"]
+    args = ["--rig", str(folder / "columns.toml"), "--json", str(tmp_path / "out.json"), "--quiet"]
+    assert main(arguments(folder, *args)) == 0
+    assert json.loads((tmp_path / "out.json").read_text())["causes"] == ["force_bias"]
 
 
 def test_plain_tasks_need_simulated_trials_and_settled_boundaries(folder, tmp_path, capsys):

@@ -24,7 +24,6 @@ KINDS = {
     ".parquet": "parquet", ".npz": "npz",
     ".hdf5": "hdf5", ".h5": "hdf5", ".mcap": "mcap", ".bag": "bag", ".db3": "bag",
 }  # fmt: skip
-EXTRAS = {"parquet": "parquet", "lerobot": "parquet", "hdf5": "hdf5", "mcap": "mcap", "bag": "bag"}
 NEEDED = {"parquet": ("pyarrow",), "lerobot": ("pyarrow",), "hdf5": ("h5py",),
           "mcap": ("mcap", "mcap_ros2"), "bag": ("rosbags",)}  # fmt: skip
 LOGS = ("mcap", "bag")  # logs of messages, which `[topics]` maps
@@ -126,7 +125,7 @@ def _module(kind: str, path: str | Path) -> ModuleType:
         try:
             importlib.import_module(library)
         except ImportError:
-            extra = EXTRAS[kind]
+            extra = "parquet" if kind == "lerobot" else kind
             raise InputError(str(path), f"needs {library}, which is not installed",
                              f"pip install 'hmmseg[{extra}]'") from None  # fmt: skip
     return importlib.import_module(f"hmmseg.io.formats.{'logs' if kind in LOGS else kind}")

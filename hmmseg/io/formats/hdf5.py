@@ -36,17 +36,13 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         if not isinstance(group, h5py.Group):
             raise InputError(str(path), "is no group of columns", "an HDF5 file")
         datasets = dict(_datasets(group, "", 0))
-        chosen = {name: each for name, each in datasets.items() if is_wanted(name, wanted)}
-        columns = flat({name: each[()] for name, each in chosen.items()})
+        columns = flat({name: each[()] for name, each in datasets.items() if is_wanted(name, wanted)})
         rate = _control_rate(file)
-    if wanted is not None:
-        columns = {name: values for name, values in columns.items() if name in wanted}
-    rest = [name for name in datasets if name not in chosen]
     if rate is not None and "t" not in datasets and (wanted is None or "t" in wanted):
         lengths = [len(values) for values in columns.values()]
         lengths = lengths or [each.shape[0] for each in datasets.values()]
         columns = {"t": np.arange(max(lengths, key=lengths.count, default=0)) / rate, **columns}
-    return make_table(f"{path}#{part}" if part else str(path), columns, rest)
+    return make_table(f"{path}#{part}" if part else str(path), columns, datasets, wanted)
 
 
 def _datasets(group: h5py.Group, prefix: str, depth: int) -> Iterator[tuple[str, h5py.Dataset]]:

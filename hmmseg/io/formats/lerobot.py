@@ -64,8 +64,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
             break
     else:
         raise InputError(f"{path}#{part}", "has no samples", "an episode")
-    rest = [name for name in columns if wanted is not None and name not in wanted]
-    return make_table(f"{path}#{part}", columns, rest, wanted)
+    return make_table(f"{path}#{part}", columns, wanted=wanted)
 
 
 def language_rows(table: pa.Table) -> list[dict[str, Any]]:

@@ -32,7 +32,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         file.seek(0)
         arrays = np.load(file, allow_pickle=False)
         columns = {name: arrays[name] for name in chosen}
-    return make_table(str(path), columns, [name for name in names if name not in chosen], wanted)
+    return make_table(str(path), columns, names, wanted)
 
 
 def num_rows(path: Path) -> int | None:

@@ -19,8 +19,7 @@ def read(path: Path, part: str | None, wanted: Sequence[str] | None) -> Table:
         names = file.schema_arrow.names
         check_unique(names, str(path))
         columns = to_columns(file.read(columns=[name for name in names if is_wanted(name, wanted)]))
-    rest = [name for name in names if not any(c == name or c.startswith(f"{name}[") for c in columns)]
-    return make_table(str(path), columns, rest, wanted)
+    return make_table(str(path), columns, names, wanted)
 
 
 def num_rows(path: Path) -> int:
