@@ -124,6 +124,7 @@ def _worlds() -> list[World]:
         World("pads 30 % off, admitted", softer=0.7, doubted=True),
         World("pads 30 % off, untold", softer=0.7),
     ]
+    out += [World("low-pass 30 ms, untold", effects={"force_lowpass": {"time_constant": 0.03}})]
     out += [World("hand as [systematic]", deviating=True)]
     out += [World("1 block", blocks=1), World("3 blocks", blocks=3), World("6 blocks", blocks=6)]
     out += [World("4 trials", trials=4), World("20 trials", trials=20)]

@@ -176,7 +176,6 @@ def _advance(table: Table, count: int, fresh: Table, t: float, dt: float, chain:
         if _enter(h, fresh.known[num_new], t, half, chain, state, 1 if off else state + 1):
             # another block, or another place: a departure
             h.state, h.missed, h.left_at = chain.num_steps, state, t
-        table.rows[i].weight -= dt / PACE  # of log1p(-away), finite after any gap
         num_new = _add(fresh, num_new, fresh, num_new)
     for j in range(num_new):
         count = _add(table, count, fresh, j)

@@ -8,8 +8,8 @@ The log-likelihoods are those of hmmseg.segmentation.emissions (tested against t
 out: an unknown weight, width or level has a broad density over the range seen, and known ones add their
 variance. A hand that is free, or carries, may also halt: otherwise a halt would pass for a rest on something,
 which predicts positions much better. A block that was just lifted moves, and the load of a resting block is
-that of the reading before: otherwise a block not yet weighed, held on its support, would pass for one carried
-at rest, whose weight is the load on the fingers.
+that of the reading before: otherwise a block held on its support would pass for one not yet weighed that is
+carried at rest, whose weight is the load on the fingers.
 
 Everything is causal. A reading is the mean of the last WINDOW s, as off line; the vertical acceleration is
 the slope of the velocity over the last SLOPE s, and an unmeasured velocity is the difference to the previous
@@ -25,7 +25,7 @@ import numpy as np
 
 from hmmseg.contact.equations import Pads, block_width, block_y, inertia_factor
 from hmmseg.densities import EDGE, log_between, log_student
-from hmmseg.levels import MOVED, TAIL
+from hmmseg.levels import MOVED, SURE, TAIL
 from hmmseg.online.compiled import compiled
 from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, STRAY, TOUCHING, WINDOW
 
@@ -314,16 +314,27 @@ def _halting(h: Record, x: Record, span: Record) -> tuple[float, float]:
 
 
 @compiled
+def _moves(h: Record, x: Record, span: Record, still: float, kept: float) -> float:
+    """Log density of the motion of a hand in the air.
+
+    It may halt, in a share `still`, or else aside, upward or in its opening alone (`kept`: log density ratio
+    of that): a straight lift must not pass for a rest, nor a reach of an open hand for a carry.
+    """
+    aside, upward = _halting(h, x, span)
+    each = log_sum(_LOG_MOVING, _LOG_STILL + aside) + log_sum(_LOG_MOVING, _LOG_STILL + kept)
+    each += log_sum(math.log1p(-still), math.log(still) + upward)
+    broad = _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy) + _log_broad(x.y, span.y)
+    return broad + log_sum(math.log1p(-still) + each, math.log(still) + aside + upward + kept)
+
+
+@compiled
 def free(h: Record, x: Record, span: Record) -> float:
     """Log-likelihood of a reading in free motion."""
-    aside, upward = _halting(h, x, span)
-    still = aside + upward
+    kept = 0.0
     if not math.isnan(x.d - x.last_d):
         sd = math.sqrt(2 * x.sd_d**2 + _square(h, WIDTH))
-        still += log_student(x.d - x.last_d, sd) + math.log(span.d)
-    broad = _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy)
-    broad += _log_broad(x.y, span.y) + _log_broad(x.d, span.d)
-    out = _ungripped(h, x, span.force) + broad + log_sum(_LOG_MOVING, _LOG_STILL + still)
+        kept = log_student(x.d - x.last_d, sd) + math.log(span.d)
+    out = _ungripped(h, x, span.force) + _log_broad(x.d, span.d) + _moves(h, x, span, STILL, kept)
     return out + EDGE if x.gripped == 2.0 else out
 
 
@@ -350,15 +361,12 @@ def lifted(
 ) -> float:  # fmt: skip
     """Log-likelihood of the remaining features, of a block above the ground.
 
-    `settled`: probability that it has been there for a while, and may halt, or keep its height as arms do.
+    `settled`: probability that it has been there for a while, and may keep its height.
     """
     factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
     fy = _force(h, x, 1) + _force(h, x, 3)
     out = _log_known(fy, factor, known, 2 * block, num_blocks, _carry(h, x), 0.0, span.force, True)
-    out += _log_broad(x.vx, span.vx) + _log_broad(x.vy, span.vy) + _log_broad(x.y, span.y)
-    still = STILL * max(settled, JUST_LIFTED)
-    aside, upward = _halting(h, x, span)
-    return out + log_sum(math.log1p(-2 * still), math.log(still) + upward + log_sum(0.0, aside))
+    return out + _moves(h, x, span, STILL * max(settled, JUST_LIFTED), 0.0)
 
 
 @compiled
@@ -373,11 +381,13 @@ def supported(
     most, variance = span.press, _carry(h, x)
     if weighed:
         most, variance = known[2 * block, 0] / known[2 * block, 1], variance + 1.0 / known[2 * block, 1]
-    force = log_between(_force(h, x, 1) + _force(h, x, 3), -span.press, most, math.sqrt(variance))
+    load, sd = _force(h, x, 1) + _force(h, x, 3), math.sqrt(variance)
+    force = log_between(load, -span.press, most, sd)
     moving = _square(h, VELOCITY)
     upward, broad = log_student(x.vy, math.sqrt(x.sd_vy**2 + moving)), _log_broad(x.vy, span.vy)
     resting, change = force + upward, x.force[1] + x.force[3] - x.last_fy
-    if not weighed and not math.isnan(change):  # the load of a resting block is steady
+    # The load of a resting block is steady; so is a weight, where nothing else rests.
+    if not math.isnan(change) and (not weighed or load < most - SURE * sd):
         same = log_student(change, 2 * math.sqrt(_square(h, FORCE)))
         same += log_student(x.vy, math.sqrt(x.sd_vy**2 + CREEP**2))
         resting = log_sum(_LOG_MOVING + resting, _LOG_STILL + same)

@@ -66,10 +66,12 @@ def settled(
     staged = np.empty((len(table), stages + 1, table.shape[1]))  # the largest table of a long recording
     staged[:, -1] = table
     staged[:, :-1] = _settling_table(table, index, free)[:, None]
-    # Within the task, fingers open to release a block; a path that departs may lose it.
-    for i, c in enumerate(columns):
-        if c is not None and i > 0 and free.states[c][0] == FREE:
+    # Within the task, a block is lowered and fingers open to release it; a path that departs may lose it.
+    for i, (before, c) in enumerate(itertools.pairwise(columns), 1):
+        if c is not None and free.states[c][0] == FREE:
             staged[:, 0, i] += free.opened[: len(table)]
+        elif c is not None and before is not None and free.states[before][0] == ABOVE_GROUND:
+            staged[:, 0, i] += free.lowered[: len(table)]
     model = _settling(log_initial, log_transition, stages, settle)
     return staged.reshape(len(table), -1), stages, model
 

@@ -17,10 +17,11 @@ from scipy.special import log_ndtr
 
 from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, SLIDING, Subtask
 from hmmseg.contact.equations import block_width
+from hmmseg.densities import log_student
 from hmmseg.hmm import dense
 from hmmseg.levels import FIRM, MOVED, SURE
 from hmmseg.robust import NORMAL, filled, median_of_known, runs
-from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods, noise_sd
+from hmmseg.segmentation.emissions import STILL, Features, Parameters, log_likelihoods, noise_sd
 from hmmseg.segmentation.fit import maximisation, otsu
 
 SAME_WIDTH = 1e-3  # chosen: m; grips this alike in width ...
@@ -120,6 +121,7 @@ def _lifted(f: Features, span: slice, guessing: bool) -> np.ndarray:
 
 STRAY = 1e-3  # prior: share of resting samples that move: settling contacts have states of their own here
 CLOSED = 1e-3  # prior: share of blocks released in place by fingers that slide off without opening
+HIGH = 0.9  # numerics: quantile of the heights of a carried block that stands for the highest
 RINGING = 0.1  # prior: share of samples that ring while a contact settles
 ROUNDS = 8  # numerics: most iterations; it converges sooner
 # cited: s; a shorter touch cannot have been meant as a lift: grip and load forces rise in turn before a lift,
@@ -136,9 +138,10 @@ class FreeContacts:
 
     A state is (contact state, index into `blocks`; None in free motion); `path` (num_timesteps,) is the most
     probable sequence of states, at samples `interval` s apart. `ringing` (num_timesteps,): log-likelihoods of
-    free motion just after a contact. `opened` (num_timesteps,): log-likelihoods of the fingers' distance if
-    they have just released a block that stays in place. `taps` [s]: touches of a block before its grip, which
-    are free motion in `path` and uninformative in `table`.
+    free motion just after a contact, in which a block may still slide out. `opened` (num_timesteps,):
+    log-likelihoods of the fingers' distance if they have just released a block that stays in place;
+    `lowered` (num_timesteps,): those of its height if it has just been set down. `taps` [s]: touches of a
+    block before its grip, which are free motion in `path` and uninformative in `table`.
     """
 
     parameters: Parameters
@@ -147,6 +150,7 @@ class FreeContacts:
     table: np.ndarray
     path: np.ndarray
     opened: np.ndarray
+    lowered: np.ndarray
     ringing: np.ndarray
     interval: float
     taps: tuple[tuple[float, float], ...] = ()
@@ -168,9 +172,11 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
     taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
     opened = _opened(f, states, path, parameters.bias)
     ringing = log_likelihoods(f, _subtasks(states[:1]), replace(parameters, levels=()), 0, rung=RINGING)[:, 0]
+    lowered, slides = _put_down(f, states, path, parameters)
+    ringing[slides] = np.logaddexp(ringing[slides], np.log(RINGING) + table[slides].max(axis=1))
     for span in tapped:
         table[span], ringing[span], path[span] = 0.0, 0.0, 0
-    return FreeContacts(parameters, blocks, states, table, path, opened, ringing, interval, taps)
+    return FreeContacts(parameters, blocks, states, table, path, opened, lowered, ringing, interval, taps)
 
 
 def _likeliest(f: Features, sliding: bool, bias: np.ndarray, scale: float, held: np.ndarray) -> Trained:
@@ -261,6 +267,29 @@ def _opened(f: Features, states: States, path: np.ndarray, bias: np.ndarray) -> 
         least[start:] = median_of_known(f.d[grip], -np.inf) + median_of_known(given[grip], 0.0) / 2
     chance = log_ndtr(np.where(np.isfinite(f.d), (f.d - least) / f.sd_d, np.inf))
     return np.logaddexp(np.log1p(-CLOSED) + chance, np.log(CLOSED))
+
+
+def _put_down(f: Features, states: States, path: np.ndarray, p: Parameters) -> tuple[np.ndarray, np.ndarray]:
+    """What tells a carried block that is set down from one that falls, both (num_timesteps,).
+
+    First, log-likelihoods of its height if it meets a support, relative to those of any motion: a block comes
+    down on its support, which one that still is where it was carried (STILL) has not. Second, samples at
+    which it may slide out of opening fingers: it still loads them then, for their grip more than while
+    carried. A support takes the load before the grip goes.
+    """
+    load = np.abs(filled(f.force[:, 1] + f.force[:, 3] - p.bias[1] - p.bias[3]))
+    grip, height = filled(f.grip - (p.bias[0] - p.bias[2]) / 2), f.block_y(p.bias)
+    state, slides, level = np.array([state for state, _ in states])[path], load > np.inf, np.nan * load
+    least = SURE * np.sqrt(2) * p.scale["force"]
+    for start, stop in runs(state != FREE):
+        carried = start + np.flatnonzero(state[start:stop] == ABOVE_GROUND)
+        slides[start:] = False
+        if carried.size:
+            weight, firm = np.median(load[carried]), np.median(grip[carried])
+            slides[start:] = firm * (load[start:] - least) > weight * grip[start:]
+            level[start:stop] = np.quantile(height[carried], HIGH)
+    aloft = np.log(STILL * f.span["y"]) + log_student(level - height, np.sqrt(2) * f.sd_y)
+    return np.where(np.isfinite(level - height), -np.logaddexp(np.log1p(-STILL), aloft), 0.0), slides
 
 
 def _tapped(states: States, path: np.ndarray, interval: float, f: Features) -> list[slice]:

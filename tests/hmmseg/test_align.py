@@ -8,11 +8,13 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from misfit_edits import EDITS, FORCES, RIG, TRIALS, TRUTH, join, let_go
 from refusals import refused
 from typer.testing import CliRunner
 
+import hmmseg
 from experiments.recordings import read_case
 from experiments.worlds import WORLDS, Cell, World, replicates, scene, simulated_cases, trials_of
 from hmmseg import example_folder
@@ -261,6 +263,35 @@ def test_a_block_that_falls_while_it_halts_in_the_air_was_not_put_down(case, whi
     (verdict,) = examine([features(thin(task_space(fallen, found.rig)), found.rig)], [found.task])
     assert verdict.failing == expected
     assert verdict.log_odds > 5  # without a look at the fingers' distance -0.3
+
+
+def carried(rate: float, falls: bool) -> pd.DataFrame:
+    """A block of 0.6 N is gripped, lifted by 30 mm, moved and, unless it falls, lowered; the hand opens."""
+    t, rng = np.arange(0.0, 6.0, 1 / rate), np.random.default_rng(int(rate))
+
+    def ease(start: float, end: float) -> np.ndarray:
+        s = np.clip((t - start) / (end - start), 0, 1)
+        return s**3 * (10 - 15 * s + 6 * s**2)
+
+    beyond = 0.0208 * (ease(0.6, 1.2) - ease(4.5, 5.1)) - 0.02  # what the pads are compressed by [m]
+    up = 0.03 * (ease(1.6, 2.4) - (0 if falls else ease(3.4, 4.2)))
+    grip = 1500 * np.maximum(beyond, 0)
+    load = np.minimum(np.minimum(0.6, 4000 * up), 2 * 0.9 * grip) / 2  # friction of 0.9
+    x = 0.1 * ease(2.4, 3.4)
+    places = {"x1": x + (beyond - 0.03) / 2, "y1": up, "x2": x - (beyond - 0.03) / 2, "y2": up}
+    forces = {"fx1": grip, "fy1": load, "fx2": -grip, "fy2": load}
+    noisy = {k: v + sd * rng.normal(size=t.size)
+             for c, sd in ((places, 2e-5), (forces, 0.01)) for k, v in c.items()}  # fmt: skip
+    return pd.DataFrame({"t": t} | noisy)
+
+
+@pytest.mark.parametrize("rate", [40.0, 50.0, 100.0, 250.0, 500.0])
+def test_a_block_that_slides_out_of_opening_fingers_was_not_put_down(rate):
+    """Where it halts in the air it may pass for a block on a support as well."""
+    rig = {"fingertip": {"normal_stiffness": 3000.0, "shear_stiffness": 2000.0},
+           "noise": {"position": 2e-5, "force": 0.01}}  # fmt: skip
+    healthy, fallen = (hmmseg.segment([carried(rate, falls)], ONE_BLOCK, rig)[0] for falls in (False, True))
+    assert healthy.complete and fallen.failed is not None and fallen.failed.subtask == "place"
 
 
 def test_a_tower_of_six_is_recognised_though_blocks_look_alike():

@@ -90,11 +90,9 @@ def test_emissions_are_those_off_line():
             aside, upward = one._halting(h, x, span)
             more = aside + upward
             np.testing.assert_allclose(more, halting[n], rtol=1e-6, atol=1e-6)
-            if step.state == FREE:  # how often a hand halts differs: a rest must not pass for a halt
-                found -= np.logaddexp(np.log1p(-halt), np.log(halt) + more)
-            if step.state == ABOVE_GROUND:
-                found -= np.log(1 - 2 * halt + halt * np.exp(upward) * (1 + np.exp(aside)))
-            if step.state in (FREE, ABOVE_GROUND):
+            if step.state in (FREE, ABOVE_GROUND):  # how often, and in what, a hand halts differs
+                each = 1 - one.STILL + one.STILL * np.exp(aside), 1 - halt + halt * np.exp(upward)
+                found -= np.log((1 - halt) * each[0] * each[1] + halt * np.exp(more))
                 found += np.logaddexp(np.log1p(-STILL), np.log(STILL) + more)
             np.testing.assert_allclose(found, expected[n, step.index], rtol=1e-6, atol=1e-6)
 
@@ -174,6 +172,25 @@ def test_a_block_let_go_in_mid_air_and_an_early_end_do_not_fit(watched):
     assert answer.fits
     final = json.loads(watcher.finish().line())
     assert not final["fits"] and final["failed"]["index"] == 5
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_hand_that_waits_has_not_left_its_task(again):
+    """Neither open, for longer than a departure is unlikely, nor with a known block that it rests to lift."""
+    watcher, t, table = read()
+    start, grip, end = np.searchsorted(t, [TRUTH[0] - 0.3, TRUTH[0] + 0.15, TRUTH[3] + 0.3])
+    order, wait = np.arange(t.size), end
+    if again:
+        objects = {"block1": {"on": "block2"}, "block2": {"on": "ground"}}
+        task = {"objects": objects, "moves": [{"object": "block1", "to": "ground"}] * 2}
+        watcher, order, wait = Watcher(Task.read(task), RIG), np.r_[:end, start:end], end + grip - start
+    noise = Rig.read(RIG).noise
+    sd = np.tile(np.repeat([noise.angle, noise.velocity, noise.force], 2), 2)
+    still = np.random.default_rng(1).normal(table[order[wait]], sd, (400, sd.size))  # 20 s
+    still[:, [5, 11]] -= still[:, [5, 11]].mean(axis=0)  # nothing is lifted yet
+    table = np.vstack([table[order[:wait]], still, table[order[wait:]]])
+    lines = follow(watcher, (t[1] - t[0]) * np.arange(len(table)), table)
+    assert max(line["departed"] for line in lines) < 0.5 and json.loads(watcher.finish().line())["fits"]
 
 
 def assert_alike(one, other):
