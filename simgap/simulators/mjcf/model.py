@@ -176,7 +176,7 @@ class MjcfSimulator:
         mujoco.mj_getState(m, data, rested, FULL)
         rested[0] = 0.0
         still = np.isfinite(rested).all() and np.abs(rested[1 + nq : 1 + nq + m.nv]).max() < STILL
-        return self._tied(rested) if still else first
+        return rested if still else first
 
     def along(self, log: Recording) -> np.ndarray:
         """Full physics states (num_timesteps, size) along a log: columns where they tell, the rest as the
