@@ -285,8 +285,6 @@ class MjcfSimulator:
 
     def contacts(self, recording: Recording) -> list[float]:
         """Times [s] at which the set of touching bodies changes along the recorded motion."""
-        if not self.touching:
-            return []
         times, what = self.contact_states(recording)
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
