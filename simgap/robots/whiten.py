@@ -137,7 +137,7 @@ class Whitener:
         return np.bincount(group[[block[0] for block in self.blocks]], self.half_logs, group.max() + 1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Covariances:
     """Of all blocks of rows."""
 
@@ -147,12 +147,6 @@ class Covariances:
     def names(self) -> tuple[str, ...]:
         """Names of all sources."""
         return tuple(dict.fromkeys(n for b in self.blocks for n in b.sources))
-
-    @cached_property
-    def _smooth(self) -> _Smooth:
-        rows = sum(b.rows.size for b in self.blocks) / max(len(self.blocks), 1)
-        every = max(1, int(len(self.blocks) * rows / (ENOUGH * max(rows, BLOCK))))
-        return _Smooth.of(self.blocks[::every], self.names)
 
     def floor(self) -> float:
         """The expected squares of whitened rows under noise alone, from which starts are read too."""
@@ -176,7 +170,7 @@ class Covariances:
             wide: Windows with a larger variance, and its factor.
             known: The discrepancy without these windows: the search begins there, and among its sources.
         """
-        smooth, names = self._smooth, self.names
+        smooth, names = _smooth(self), self.names
         left, rest = smooth.projected(residual, wide or {})
         x = smooth.first_guess(left)
         if known is not None:
@@ -358,6 +352,13 @@ class _Smooth:
         value += 0.5 * float(self.share @ np.log(own) + np.sum(rest**2 / own))
         slope = slope + self.white @ (self.share / own - (rest / own) ** 2)
         return value, 0.5 * variance * slope
+
+
+@lru_cache(maxsize=1)  # of the latest alone, as a search keeps the covariances of all its sets
+def _smooth(of: Covariances) -> _Smooth:
+    rows = sum(b.rows.size for b in of.blocks) / max(len(of.blocks), 1)
+    every = max(1, int(len(of.blocks) * rows / (ENOUGH * max(rows, BLOCK))))
+    return _Smooth.of(of.blocks[::every], of.names)
 
 
 def _inverted(matrices: np.ndarray) -> tuple[np.ndarray, float]:

@@ -446,6 +446,23 @@ def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files, 
     np.testing.assert_allclose(state, [left, right, rate, other], atol=0.02 * abs(left - right))
 
 
+def test_a_joint_pushed_on_past_a_stop_starts_where_it_came_to_rest(files):
+    """The tie stretches from the log's beginning, as in plain MuJoCo."""
+    xml = TIED.replace('damping="20"', 'damping="20" range="-1 0.03" limited="true"')
+    columns = '[columns.w]\njoint = "right"\n[columns.u]\nactuator = "servo"\nunit = "m"\n'
+    found, model = load_mjcf(*files(xml, columns)), mujoco.MjModel.from_xml_string(xml)
+    data, t = mujoco.MjData(model), np.arange(0, 1, 0.01)
+    data.ctrl[:] = 0.08
+    mujoco.mj_step(model, data, nstep=2000)
+    left, right = data.qpos
+    assert left - right > 0.002
+    log = Recording("a.csv", t, {"w": np.full(t.size, right), "u": np.full(t.size, 0.08)})
+    found.effects([log])
+    at_rest = {"w": right, "w_rate": 0.0}
+    states = found.simulator._states([Job({}, log.window(k, 30), at_rest) for k in (0, 20)])
+    np.testing.assert_allclose(states[:, 1:3], [[left, right]] * 2, atol=0.02 * (left - right))
+
+
 @pytest.fixture
 def urdf(tmp_path):
     def write(described: str = MAP.replace('"m"', '"pivot"')):

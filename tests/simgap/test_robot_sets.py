@@ -18,7 +18,17 @@ from simgap.robots.rows import Rows, phases_of, rows_of
 from simgap.robots.search import FittedSet, _overstated, predicts_better
 from simgap.robots.sets import Sets, neighbours, pairs
 from simgap.robots.verdict import _absurd, _explanations, _score_of_noise
-from simgap.robots.whiten import CONTACTS, LIES, TAU, Block, Covariances, Discrepancy, Source, covariances
+from simgap.robots.whiten import (
+    CONTACTS,
+    LIES,
+    TAU,
+    Block,
+    Covariances,
+    Discrepancy,
+    Source,
+    _smooth,
+    covariances,
+)
 from simgap.robots.windows import AT_REST, FLIES, REGIMES, RESTS, STRIKES, cut, resting
 from simgap.simulators.protocol import Channel, Parameter
 from simgap.simulators.recording import Recording
@@ -126,7 +136,7 @@ def test_what_shows_in_every_window_is_no_windows_own_and_the_likelihood_has_its
     worse = sum(density(b, {}, r) - density(b, left, r) for b, r in both)
     assert _score_of_noise(one) == pytest.approx(7.0 + worse)
     assert len(cov.outliers(cov.whitener(), linear.residual)) > 15
-    smooth = Covariances(tuple(block(k) for k in range(3)))._smooth
+    smooth = _smooth(Covariances(tuple(block(k) for k in range(3))))
     left, x = np.random.default_rng(2).standard_normal(smooth.plain.shape[:2]), np.array([-0.5, 0.3])
     rest = np.random.default_rng(5).standard_normal(smooth.share.size)
     slope = smooth.cost(x, left, rest)[1]

@@ -176,7 +176,7 @@ class MjcfSimulator:
         mujoco.mj_getState(m, data, rested, FULL)
         rested[0] = 0.0
         still = np.isfinite(rested).all() and np.abs(rested[1 + nq : 1 + nq + m.nv]).max() < STILL
-        return self._tied(rested) if still else first
+        return rested if still else first
 
     def along(self, log: Recording) -> np.ndarray:
         """Full physics states (num_timesteps, size) along a log: columns where they tell, the rest as the
@@ -285,8 +285,6 @@ class MjcfSimulator:
 
     def contacts(self, recording: Recording) -> list[float]:
         """Times [s] at which the set of touching bodies changes along the recorded motion."""
-        if not self.touching:
-            return []
         times, what = self.contact_states(recording)
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
