@@ -141,7 +141,7 @@ def page(body: Body, setting: Setting, draw: Callable[[Callable[[str], Path]], N
         more_cells=max(len(cells) - MOST, 0),
         images=dict.fromkeys(("gap_where", "gap_signal", "gap_before_after")) | images,
         suspects=_suspects(body, setting), attributed=bool(body.get("attribution")),
-        robot=finding.of_robot(body), compared="changes" in body, motion=setting.motion,
+        robot="numerics" in body, compared="changes" in body, motion=setting.motion,
         calibrated=[(plain_name(n), *_values(n, p, shown_as(p["unit"]), setting)) for n, p in fitted.items()],
         properties=_properties(effect, measured) if effect and body["causes"] else [],
         measured=measured is not None, numerics=_numerics(body), detection=_detection(body), far=_far(body),
@@ -247,7 +247,7 @@ def _detection(body: Body) -> str:
     text = f"A healthy recording of this rig and task differs from it as much with {finding.p_text(p)}"
     if "changes" in body:
         text = f"Logs of a robot that did not change differ as much with {finding.p_text(p)}"
-    elif finding.of_robot(body):
+    elif "numerics" in body:
         text = f"Logs of a robot that is as its model differ from it as much with {finding.p_text(p)}"
     if not fineness:
         return f"{text}."

@@ -287,7 +287,8 @@ def _deliver(
         lines = "".join(json.dumps(run, ensure_ascii=False) + "\n" for run in runs)
         out.stage(own.history).write_text(lines, encoding="utf-8")
     folder = own.patch or out.figures or (out.report.parent if out.report is not None else None)
-    motion, place = robot.next_motion(document, logs), None
+    asked, place = (document.get("next_experiment") or {}).get("log"), None
+    motion = next((log for log in logs if log.name == asked), None)
     if motion is not None and folder is not None:
         name = "next_motion.csv"
         while any(log.name == name for log in logs):  # the motion that was asked for last time

@@ -52,7 +52,12 @@ def segment(
                 raise InputError("--workers, --scheduler", "go with tasks of blocks alone")
             if method == "qualitative":
                 raise InputError("--method qualitative", "needs a task of blocks", "--method hmm")
-            recordings, found = _segment_sequence(out, paths, description, rig, model)
+            from hmmseg.sequence.model import load_model
+            from hmmseg.sequence.segment import segment_sequence
+
+            recordings = read_trials(out, paths, None if rig is None else read_rig(rig), description)
+            learned = None if model is None else load_model(model, description)
+            found = segment_sequence(recordings, description, learned)
         else:
             rig = require_rig(rig, paths)
             if model is not None:
@@ -129,16 +134,6 @@ def _segment_long(out: Output, paths: Sequence[Path], task: BlockTask, rig: Rig)
         out.warn(*check(recording.beginning(), rig))
         found.append(segment_long(recording, task, rig))
     return found
-
-
-def _segment_sequence(
-    out: Output, paths: Sequence[Path], task: SequenceTask, rig: Path | None, model: Path | None
-) -> tuple[list[Trial], list[Segmentation]]:
-    from hmmseg.sequence.model import load_model
-    from hmmseg.sequence.segment import segment_sequence
-
-    recordings = read_trials(out, paths, None if rig is None else read_rig(rig), task)
-    return recordings, segment_sequence(recordings, task, None if model is None else load_model(model, task))
 
 
 def warn_of_misfits(out: Output, found: Sequence[Segmentation]) -> None:

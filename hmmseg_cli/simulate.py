@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,7 +54,10 @@ def simulate(
         else:
             files, document, films = _replay(out, replay, description, hand, blocks)
         files = scene_files(description, hand, blocks) | files
-        _spare_inputs(output, files, [task, rig, properties, replay, operator])
+        targets = {(output / name).resolve() for name in files}
+        for path in (task, rig, properties, replay, operator):
+            if path is not None and path.resolve() in targets:
+                raise InputError(f"--output {output}", f"would replace the input {path}", "another folder")
         for name, text in files.items():
             out.stage(output / name).write_text(text, encoding="utf-8")
         written = [output / name for name in files]
@@ -135,14 +138,6 @@ def _replay(
                            "net_force_residual_over_noise": summary}}  # fmt: skip
     scene = Scene(result.t, result.motion, {name: blocks[name] for name in task.objects}, rig)
     return trial_files(1, predicted, boundaries, out.seed), document, {"trial_01": (scene, traces)}
-
-
-def _spare_inputs(folder: Path, names: Mapping[str, str], inputs: Iterable[Path | None]) -> None:
-    """InputError if a file to be written is one of the inputs."""
-    targets = {(folder / name).resolve() for name in names}
-    for path in inputs:
-        if path is not None and path.resolve() in targets:
-            raise InputError(f"--output {folder}", f"would replace the input {path}", "another folder")
 
 
 def _draw_replay(result: Replay, segmentation: Segmentation, path: Path) -> None:

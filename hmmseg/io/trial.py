@@ -128,7 +128,10 @@ def trial_of(table: Table, rig: Rig | None, task: SequenceTask | None, whole: bo
             raise InputError(f"{table.file}: column {name}", f"has {len(values)} rows",
                              f"{table.rows.size} as in the others")  # fmt: skip
     _check_names(table, columns, names, optional, task is not None)
-    more = () if task is not None or rig is None or rig.gripper else _of_more_fingers(table.names)
+    fingers = task is None and rig is not None and rig.gripper is None
+    third = ", ".join(name for name in table.names if fingers and _finger(name) > 2)
+    more = (f"columns {third} are left out: hands have two fingers here, and what a third bears is missing "
+            "from weights",) if third else ()  # fmt: skip
     t, origin = mapped_times(table, rig)
     channels: dict[str, np.ndarray] = {}
     if names is None:  # all channels of a plain task, by our names where they are mapped
@@ -186,15 +189,6 @@ def _finger(name: str) -> int:
     """Number of the finger whose channel has this name, 0 of any other."""
     found = re.fullmatch(r"[vf]?[xy](\d)|d?q(\d)[12]", name)
     return 0 if found is None else int(found.group(1) or found.group(2))
-
-
-def _of_more_fingers(names: tuple[str, ...]) -> tuple[str, ...]:
-    """A warning about columns that are named as those of a third finger."""
-    found = [name for name in names if _finger(name) > 2]
-    if not found:
-        return ()
-    return (f"columns {', '.join(found)} are left out: hands have two fingers here, and what a third bears "
-            "is missing from weights",)  # fmt: skip
 
 
 def _check_names(table: Table, columns: Mapping[str, Column], names: tuple[str, ...] | None,

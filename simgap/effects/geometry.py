@@ -211,10 +211,6 @@ def _correct_backlash(world: World, values: Values, on: Array) -> World:
     )
 
 
-def _apply_backlash(p: Performance, values: Values, rng: np.random.Generator) -> Performance:
-    return moved_joints(p, {}, lambda q: np.stack([channels.play(a, values["width"]) for a in q.T], 1))
-
-
 BACKLASH = HandEffect(
     name="backlash",
     acts_on="kinematics",
@@ -231,7 +227,9 @@ BACKLASH = HandEffect(
     forms=(("width",), ("width", "unseen")),
     stage=KINEMATICS,
     correct=_correct_backlash,
-    apply=_apply_backlash,
+    apply=lambda p, v, rng: moved_joints(
+        p, {}, lambda q: np.stack([channels.play(a, v["width"]) for a in q.T], 1)
+    ),
 )
 
 

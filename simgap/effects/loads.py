@@ -56,10 +56,6 @@ VISCOUS_DRAG = loading(
 MIDDLE = (0.13, 0.02)  # prior: m; about where the fingers work
 
 
-def _cable(m: Motion, values: Values) -> Array:
-    return values["stiffness"] * (m.position - MIDDLE * 2) + [values["at_x"], values["at_y"]] * 2
-
-
 def _report_cable_force(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
     k = draws["stiffness"]
     k = np.where(np.abs(k) < 1e-3, 1e-3, k)
@@ -68,7 +64,7 @@ def _report_cable_force(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
 
 
 CABLE_FORCE = loading(
-    _cable,
+    lambda m, v: v["stiffness"] * (m.position - MIDDLE * 2) + [v["at_x"], v["at_y"]] * 2,
     given=lambda v: v | {f"at_{a}": v["stiffness"] * (MIDDLE[i] - v[f"{a}0"]) for i, a in enumerate("xy")},
     name="cable_force",
     acts_on="dynamics",

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hmmseg.io.rig import Rig
-from simgap.effect import Array, Parameter
+from simgap.effect import Parameter
 from simgap.effects.base import (
     CONTACT,
     HAND,
@@ -15,7 +14,6 @@ from simgap.effects.base import (
     HandEffect,
     Performance,
     Values,
-    World,
     flat,
     turning_compliance,
     with_force,
@@ -136,21 +134,7 @@ TABLE_TILT = HandEffect(
 )
 
 
-# A support that yields under load, slightly delayed.
-
-
-def _correct_table_compliance(world: World, values: Values, on: Array) -> World:
-    # Its mass and damping delay it by some hundredths of a second.
-
-    return with_mode(world, YIELDING, on)._replace(
-        give_support=world.give_support + values["give"],
-        support_time=world.support_time + on * values["settling"],
-    )
-
-
-def _report_table_compliance(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
-    return {"stiffness": (1 / draws["give"].clip(1e-7), "N/m")}
-
+# A support that yields under load; its mass and damping delay it by some hundredths of a second.
 
 TABLE_COMPLIANCE = HandEffect(
     name="table_compliance",
@@ -165,8 +149,10 @@ TABLE_COMPLIANCE = HandEffect(
         "settling": Parameter(0.02, 0.8, "s", low=1e-3, high=0.2, log=True, hidden=True),
     },
     stage=CONTACT,
-    correct=_correct_table_compliance,
-    report=_report_table_compliance,
+    correct=lambda w, v, on: with_mode(w, YIELDING, on)._replace(
+        give_support=w.give_support + v["give"], support_time=w.support_time + on * v["settling"]
+    ),
+    report=lambda draws, rig: {"stiffness": (1 / draws["give"].clip(1e-7), "N/m")},
     scene=lambda v: {"support_stiffness": v["stiffness"]},
     wrist=True,
     played={"stiffness": 1500.0},

@@ -463,7 +463,8 @@ def rounded_variance(given: Problem, step: float) -> np.ndarray:
     frame, there = given.frame, given.there
     rows, sample, scale = rows_of(given), np.nonzero(there)[1], given.weight[there]
     shares, out = _shares(given), np.zeros(scale.size)
-    levels = [_plateaus(force) for force in frame.forces]
+    # Number of the plateau of each reading.
+    levels = [np.cumsum(np.diff(f, axis=0, prepend=f[:1]) != 0, axis=0) for f in frame.forces]
     for mine in rows.by_cell():
         trial, of_channel = rows.trial[mine[0]], shares[:, rows.channel[mine[0]]]
         group = frame.groups[trial]
@@ -488,11 +489,6 @@ def _shares(given: Problem) -> np.ndarray:
             ):  # fmt: skip
                 out[2 * finger + axis, CHANNELS.index(channel)] = share
     return out
-
-
-def _plateaus(force: np.ndarray) -> np.ndarray:
-    """Number (N, 4) of the plateau of each reading."""
-    return np.cumsum(np.diff(force, axis=0, prepend=force[:1]) != 0, axis=0)
 
 
 def _on_plateaus(level: np.ndarray, sample: np.ndarray, group: int) -> np.ndarray:

@@ -149,20 +149,13 @@ def body(
         "next_experiment": following,
     }  # fmt: skip
     if verdict.small_gap is not None:
-        small = verdict.small_gap
+        small, c, arrays = verdict.small_gap, CHANNELS.index(verdict.small_gap.channel), given.frame.arrays
+        noise = float(np.median(arrays.sd[..., c][arrays.there[..., c] > 0]))  # in the channel's unit
         metres = small.channel in ("x", "y", "distance", "offset")
         unit = "m" if metres else "m/s" if small.channel in ("vx", "vy") else "N"
-        out["small_gap"] = {
-            "size": small.amount * _unit_of_noise(found, small.channel), "unit": unit,
-            "where": where(given, verdict.where, None),
-        }  # fmt: skip
+        places = where(given, verdict.where, None)
+        out["small_gap"] = {"size": small.amount * noise, "unit": unit, "where": places}
     return out
-
-
-def _unit_of_noise(found: Search, channel: str) -> float:
-    """Median noise of a channel's residuals, in its unit."""
-    arrays, c = found.problem.frame.arrays, CHANNELS.index(channel)
-    return float(np.median(arrays.sd[..., c][arrays.there[..., c] > 0]))
 
 
 def parameters(found: Search, posterior: EffectPosterior, name: str, seed: int) -> dict[str, Any]:
@@ -330,7 +323,9 @@ def diagnose(
 
     null = () if healthy is None else healthy_statistics(found, healthy, actual)
     gap, verdict = attributed(found, forced, seed, null)
-    causes = _causes(found, gap, verdict)
+    named = (gap.candidates[verdict.effects[name].candidate] for name in verdict.causes)
+    shifting = [c for c in named if _shifts_signals(c)]
+    causes = _together(found, shifting) if shifting else found.healthy
     following = None
     if verdict.verdict == "set":
         tell("the next experiment")
@@ -338,12 +333,15 @@ def diagnose(
         values = {n: {k: p["mean"] for k, p in each.items()} for n, each in mine.items()}
         following = next_experiment(found, values, verdict.indistinguishable, seed, actual)
     document = body(found, verdict, causes, following, seed)
-    warnings = (*found.warnings, *_inseparable(verdict, following))
+    warnings, separated = [*found.warnings], [] if following is None else following["separates"]
+    if left := sorted(set(verdict.indistinguishable) - set(separated)):
+        cause = " + ".join(verdict.causes)
+        warnings.append(f"no experiment listed is expected to separate {', '.join(left)} from {cause}")
     if found.problem.frame.num_trials == 1:
-        warnings = (*warnings, "one trial: an accident of it looks like an effect")
+        warnings.append("one trial: an accident of it looks like an effect")
     before = residual_at(found.problem, (), found.healthy.u)
     after = residual_at(found.problem, causes.effects, causes.u)
-    return Diagnosis(document, found, causes, verdict, before, after, warnings, seed)
+    return Diagnosis(document, found, causes, verdict, before, after, tuple(warnings), seed)
 
 
 def healthy_statistics(found: Search, healthy: AlignedTrials, actual: Actual | None) -> Iterator[float]:
@@ -353,13 +351,6 @@ def healthy_statistics(found: Search, healthy: AlignedTrials, actual: Actual | N
     for start in range(0, len(every) - size + 1, size):
         f = forms(search(replace(healthy, trials=every[start : start + size]), actual).gap)
         yield statistic(f, sought(f))
-
-
-def _inseparable(verdict: Attribution, following: dict[str, Any] | None) -> list[str]:
-    """A warning that names effects that no listed experiment is expected to separate from the causes."""
-    left = sorted(set(verdict.indistinguishable) - set([] if following is None else following["separates"]))
-    text = f"no experiment listed is expected to separate {', '.join(left)} from {' + '.join(verdict.causes)}"
-    return [text] if left else []
 
 
 def attributed(
@@ -416,10 +407,3 @@ def _together(found: Search, which: Sequence[Candidate], start: np.ndarray | Non
         keys.append(next(key for key in forms_of(c.name) if free_parameters(key) == c.parameters))
         u[columns_of(found.problem, keys[-1:])[found.problem.num_common :]] = c.at
     return fit(found.problem, tuple(keys), u)
-
-
-def _causes(found: Search, gap: Gap, verdict: Attribution) -> Fitted:
-    """The joint fit of the verdict's effects that shift signals, in the forms in which they were found."""
-    named = [gap.candidates[verdict.effects[name].candidate] for name in verdict.causes]
-    shifting = [c for c in named if _shifts_signals(c)]
-    return _together(found, shifting) if shifting else found.healthy

@@ -18,7 +18,7 @@ from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
 from hmmseg.levels import SURE
 from hmmseg.robust import bridged
-from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
+from hmmseg.segmentation.align import AlignedTrials
 from simgap.effects import catalogue, forms_of, free_parameters
 from simgap.effects.base import World
 from simgap.gap.rounding import rounding_error, rounding_step
@@ -60,12 +60,6 @@ def absent(trial: Trial) -> tuple[str, ...]:
     if trial.inertia is None:
         return ()
     return (*DERIVED, *GRIP) if "friction" in trial.hidden else DERIVED
-
-
-def not_compared(trials: Sequence[Trial]) -> str:
-    """One line that says what a diagnosis leaves out."""
-    missing = dict.fromkeys(name for trial in trials for name in absent(trial))
-    return NOT_COMPARED.format(absent=", ".join(missing))
 
 
 def shown(names: Sequence[str]) -> list[str]:
@@ -164,16 +158,13 @@ def _of_mean_tip(
     return dict(zip(names + rates, np.concatenate([angles, rate], 1).T, strict=True))
 
 
-def boundary_quantiles(aligned: TrialAlignment) -> np.ndarray:
-    """Quantiles (3, B) [s] of every boundary: EITHER_SIDE, the median, and 1 - EITHER_SIDE."""
-    levels = (EITHER_SIDE, 0.5, 1 - EITHER_SIDE)
-    return np.array([[b.quantile(p) for b in aligned.boundaries] for p in levels])
-
-
 def trial_arrays(
     trial: Trial, quantiles: np.ndarray, steps: tuple[Subtask, ...], rig: Rig
 ) -> dict[str, np.ndarray]:
-    """One trial's signals, states and noise as arrays over its samples."""
+    """One trial's signals, states and noise as arrays over its samples.
+
+    `quantiles` (3, B) [s] of every boundary: EITHER_SIDE, the median, and 1 - EITHER_SIDE.
+    """
     trial, group = thinned(trial, rig)
     first, boundaries, last = quantiles
     signals = task_space(trial, rig)
@@ -188,7 +179,8 @@ def trial_arrays(
     speeds = trial.channels if rig.jointed else signals.__dict__
     rates = np.stack([speeds[f"d{n}" if rig.jointed else f"v{n}"] for n in names], 1)
     there = _there(t, phase, *(np.asarray(np.isfinite(z).all(1)) for z in (force, joints, rates)))
-    force, joints, rates = (_filled(t, z) for z in (force, joints, rates))
+    # Missing samples are interpolated; they are masked where they count.
+    force, joints, rates = (np.stack([bridged(c, t) for c in z.T], 1) for z in (force, joints, rates))
     sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
     # The finger that touches first pushes the block for a while, and so does a closing hand; a carried block
@@ -311,11 +303,6 @@ def _moves(
     return np.where(found >= 0, found, distance.argmin(axis=0))
 
 
-def _filled(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Columns with missing samples interpolated (they are masked where they count)."""
-    return np.stack([bridged(column, t) for column in values.T], axis=1)
-
-
 def _there(
     t: np.ndarray, phase: np.ndarray, force: np.ndarray, place: np.ndarray, speed: np.ndarray
 ) -> np.ndarray:
@@ -421,7 +408,9 @@ def build(aligned: AlignedTrials) -> Frame:
     if not chosen:
         raise ValueError("no trial fits its task")
     trials = [a.trial for a in chosen]
-    rows = [trial_arrays(a.trial, boundary_quantiles(a), steps, rig) for a in chosen]
+    levels = (EITHER_SIDE, 0.5, 1 - EITHER_SIDE)
+    ends = [np.array([[b.quantile(p) for b in a.boundaries] for p in levels]) for a in chosen]
+    rows = [trial_arrays(t, q, steps, rig) for t, q in zip(trials, ends, strict=True)]
     length = max(r["t"].size for r in rows)
     stack = {key: _stacked([r[key] for r in rows], length) for key in rows[0] if key != "events"}
     events = np.stack([r["events"] for r in rows])

@@ -19,9 +19,9 @@ from simgap.attribution.problem import Gap
 from simgap.bounded import least
 from simgap.effect import Parameter
 from simgap.effects import catalogue, forms_of, name_of
-from simgap.effects.base import World, tips
+from simgap.effects.base import tips
 from simgap.gap.assemble import Scatter, gap_of, redrawn, scatters
-from simgap.gap.frame import build, not_compared, of_wrist, shown, shown_forms, thinned
+from simgap.gap.frame import NOT_COMPARED, absent, build, of_wrist, shown, shown_forms, thinned
 from simgap.gap.nuisances import with_nuisances
 from simgap.gap.problem import (
     Fitted,
@@ -138,15 +138,10 @@ def realigned(aligned: AlignedTrials, given: Problem, found: Fitted, all_fit: bo
         columns = np.concatenate([np.asarray(z[r, :n]) for z in (position, velocity, force)], 1)
         small, _ = thinned(trial, rig)
         rows.append(replace(task_space(small, rig), **dict(zip(names, columns.T, strict=True))))
-    again = align(trials, frame.task, _hand(rig, world), all_fit, rows)
-    return replace(again, rig=rig)
-
-
-def _hand(rig: Rig, world: World) -> Rig:
-    """The rig with the pads that the candidate gives it."""
     give = {"normal": float(np.mean(world.give_normal)), "shear": float(np.mean(world.give_shear))}
-    pads = {f"{k}_stiffness": 1 / v for k, v in give.items() if v > 1e-7}
-    return rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
+    pads = {f"{k}_stiffness": 1 / v for k, v in give.items() if v > 1e-7}  # that the candidate gives the rig
+    hand = rig.model_copy(update={"fingertip": rig.fingertip.model_copy(update=pads)})
+    return replace(align(trials, frame.task, hand, all_fit, rows), rig=rig)
 
 
 ROUNDS = 2  # numerics: most realignments
@@ -225,7 +220,11 @@ def search(
     if not any(t.segmentation.complete for t in aligned.trials):
         tell("aligning trials that seem not to fit")
         aligned, misled = _aligned_all(aligned, actual, keys)
-    every, aligned = aligned, _complete(aligned)
+    every, fitting = aligned.trials, tuple(one for one in aligned.trials if one.segmentation.failed is None)
+    if not fitting:
+        reason = str(every[0].segmentation.failed)
+        raise InputError(every[0].trial.file, reason, "a recording that shows every subtask")
+    aligned = replace(aligned, trials=fitting)
     known = [(actual or {}).get(name, {}) for name in aligned.task.objects]
     if identified is None and not all(kind in own for own in known for kind in PROPERTIES):
         tell("identifying properties")
@@ -238,8 +237,9 @@ def search(
     others = redrawn(given)
     scattering = scatters(given, healthy.residual, names)
     gap = gap_of(given, healthy, fits, scattering, others)
-    warnings = [not_compared(trials)] if of_wrist(trials) else []
-    failures = [(one.trial.name, one.segmentation.failed) for one in every.trials]
+    missing = dict.fromkeys(name for trial in trials for name in absent(trial))
+    warnings = [NOT_COMPARED.format(absent=", ".join(missing))] if missing else []
+    failures = [(one.trial.name, one.segmentation.failed) for one in every]
     warnings += [f"{name}: {why}; left out" for name, why in failures if why is not None]
     return Search(aligned, given, healthy, tuple(fits), tuple(scattering), gap, others,
                   identified, (*misled, *warnings))  # fmt: skip
@@ -271,12 +271,3 @@ def _aligned_all(
                 return again, [f"{why}; without {name_of(f.effects[0])} it fits"]
         aligned = realigned(aligned, given, found[0], all_fit=True)
     return failed, []
-
-
-def _complete(aligned: AlignedTrials) -> AlignedTrials:
-    """The trials that fit their task."""
-    keep = tuple(one for one in aligned.trials if one.segmentation.failed is None)
-    if not keep:
-        one = aligned.trials[0]
-        raise InputError(one.trial.file, str(one.segmentation.failed), "a recording that shows every subtask")
-    return replace(aligned, trials=keep)

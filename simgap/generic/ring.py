@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import stdtrit
 
-from simgap.generic.trials import Cut, Layout, resampled, windowed
+from simgap.generic.trials import Layout, resampled, windowed
 
 LEAST = 4  # numerics: fewest coefficients in a mean power
 DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: grid of the search
@@ -60,10 +60,6 @@ def find_ring(lay: Layout) -> Ring | None:
     compared = float(np.mean([c.edges[-1] - c.edges[-2] for c in kinds[0]]))
     longest = min(c.trial.t[-1] - c.edges[-2] for c in kinds[0])
     since = np.arange(0.0, longest, 1 / lay.rate) if longest > compared + 0.5 / lay.rate else np.zeros(0)
-
-    def beyond(cut: Cut, name: str) -> np.ndarray:
-        return resampled(cut.trial.t, cut.trial.channels[name], cut.edges[-2] + since, lay.rate)
-
     for k in range(1, last + 1):
         for c, name in enumerate(lay.ensembles.channels):
             real, sim = (np.array([windowed(lay, cut, c, k) for cut in kind]) for kind in kinds)
@@ -72,7 +68,8 @@ def find_ring(lay: Layout) -> Ring | None:
             rest = real - sim.mean(0)  # what is simulated too is no ringing
             windows = list(rest if rest.var(1).mean() < real.var(1).mean() else real)
             if k == last and since.size:
-                windows = [beyond(cut, name) for cut in kinds[0]]
+                windows = [resampled(cut.trial.t, cut.trial.channels[name], cut.edges[-2] + since, lay.rate)
+                           for cut in kinds[0]]  # fmt: skip
             swings = from_swing(windows)
             share = 1 - _screened(swings, lay.rate)[2]
             strength = share * np.square(_detrended(swings)).sum() / (len(swings) * lay.scale[c] ** 2)

@@ -105,14 +105,6 @@ def _unit(channel: str) -> tuple[float, str]:
     return 100.0, f"{channel} [cm{'/s' if channel.startswith('v') else ''}]"
 
 
-def _recorded(found: Diagnosis, trial: int, channel: str) -> np.ndarray:
-    """A recorded signal in task space (T,), SI units; as grip the lesser of the two fingers' forces."""
-    world = found.problem.frame.world
-    if channel == "grip":
-        return np.minimum(world.force[trial, :, 0], -world.force[trial, :, 2])
-    return channels(world)[trial, :, list(CHANNELS).index(channel)]
-
-
 def _draw_trial(found: Diagnosis, path: Path) -> None:
     """Draw channel and trial of the largest excess: recorded, simulated, corrected."""
     frame = found.problem.frame
@@ -126,7 +118,8 @@ def _draw_trial(found: Diagnosis, path: Path) -> None:
     with canvas(path, height=3.4) as figure:
         above, below = figure.subplots(2, 1, sharex=True)
         factor, label = _unit(channel)
-        recorded = _recorded(found, r, channel)[:n]
+        lesser = np.minimum(frame.world.force[r, :n, 0], -frame.world.force[r, :n, 2])
+        recorded = lesser if channel == "grip" else channels(frame.world)[r, :n, c]
         above.plot(t, factor * recorded, color="black", lw=1.2, label="recorded")
         off = found.problem.weight[r, :n, c]
         for residual, colour, name in ((found.before, RED, "simulated"), (found.after, BLUE, "corrected")):

@@ -227,11 +227,6 @@ def doubted(body: Body) -> list[str]:
     return [f"The best known explanation, {plain_name('+'.join(best['effects']))}, is doubtful: {doubts}."]
 
 
-def of_robot(body: Body) -> bool:
-    """Whether the diagnosis is of a robot's logs."""
-    return "numerics" in body
-
-
 def sentence(body: Body, rig: Mapping[str, Any] | None = None) -> str:
     """The whole finding as a paragraph, for a terminal."""
     text = " ".join([*sentences(body), *remains(body)])

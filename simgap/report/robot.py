@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,12 +99,6 @@ def residuals(found: RobotDiagnosis) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (N,) before and after correction, held out if the diagnosis was cross-validated."""
     far = found.shrinkage
     return (found.plain.residual, found.linear.residual) if far is None else (far.plain, far.residual)
-
-
-def next_motion(document: Mapping[str, Any], logs: Iterable[Recording]) -> Recording | None:
-    """The log whose motion the next experiment repeats, if any."""
-    asked = (document.get("next_experiment") or {}).get("log")
-    return next((log for log in logs if log.name == asked), None)
 
 
 def motion_csv(

@@ -54,10 +54,9 @@ VALUES = st.recursive(
     max_leaves=12)  # fmt: skip
 KEYS = ("rate", "gravity", "fingertip", "noise", "systematic", "tolerance", "columns", "topics", "gripper",
         "fingers", "effects", "objects", "moves", "repeat", "sequence", "channels", "optional")  # fmt: skip
-SETTINGS = st.sampled_from(sorted(OperatorSettings.model_fields))
 DOCUMENTS = st.one_of(
     VALUES,
-    st.dictionaries(SETTINGS, VALUES, max_size=3),
+    st.dictionaries(st.sampled_from(sorted(OperatorSettings.model_fields)), VALUES, max_size=3),
     st.fixed_dictionaries({"properties": st.fixed_dictionaries({"a": VALUES})}),
 )
 LAB = example_folder()

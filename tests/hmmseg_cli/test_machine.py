@@ -41,7 +41,6 @@ COMMANDS = {"decompose": ["decompose", "task.toml", "--json", "out.json"],
             "diagnose": ["diagnose", "trial.csv", "--against", "trial_2.csv", "trial_3.csv", "--task",
                          "order.toml", "--json", "out.json"]}  # fmt: skip
 INTERRUPTED = ("decompose", "inspect", "new", "segment", "identify", "fit", "simulate")
-COSTLY = {"watch": 30, "diagnose": 5}  # how many calls of each kind are refused at most
 QUICK = ("decompose", "new", "segment")
 ROWS = b"".join((STACK / "trial_01.csv").read_bytes().splitlines(keepends=True)[:40])
 FULL = OSError(28, "No space left on device")
@@ -90,7 +89,7 @@ def restore(folder, before):
 class Refusing:
     """Counts calls of a function of the system, and refuses the one of this number."""
 
-    def __init__(self, real, error, at=-1, counted=lambda *_: True):
+    def __init__(self, real, error, at, counted=lambda *_: True):
         self.real, self.error, self.at, self.counted, self.calls = real, error, at, counted, 0
 
     def __call__(self, *arguments, **more):
@@ -110,20 +109,18 @@ def own(path, *_):
 
 CALLS = {"open": (builtins, "open", PermissionError(13, "Permission denied"), own),
          "io.open": (io, "open", OSError(24, "Too many open files"), own),
-         "rename": (os, "replace", FULL, lambda *_: True),
-         "copy": (shutil, "copyfile", FULL, lambda *_: True), "folder": (os, "mkdir", FULL, lambda *_: True),
-         "write": (os, "fdopen", FULL, lambda *_: True), "sync": (os, "fsync", FULL, lambda *_: True),
-         "memory": (json, "dumps", MemoryError(), lambda *_: True),
-         "Ctrl-C in a copy": (shutil, "copyfile", KeyboardInterrupt(), lambda *_: True),
-         "Ctrl-C in a rename": (os, "replace", KeyboardInterrupt(), lambda *_: True)}  # fmt: skip
+         "rename": (os, "replace", FULL), "copy": (shutil, "copyfile", FULL), "folder": (os, "mkdir", FULL),
+         "write": (os, "fdopen", FULL), "sync": (os, "fsync", FULL), "memory": (json, "dumps", MemoryError()),
+         "Ctrl-C in a copy": (shutil, "copyfile", KeyboardInterrupt()),
+         "Ctrl-C in a rename": (os, "replace", KeyboardInterrupt())}  # fmt: skip
 
 
 def tortured(lab, name, kind, monkeypatch, capsys, most):
     """Refuse each call of a kind in turn; the number of calls that a command makes."""
-    module, attribute, error, counted = CALLS[kind]
+    module, attribute, error, *counted = CALLS[kind]
     real, before = getattr(module, attribute), files(lab)
     assert run(name, monkeypatch) == 0  # everything is imported, and kept that is kept
-    whole, count = files(lab), Refusing(real, error, counted=counted)
+    whole, count = files(lab), Refusing(real, error, -1, *counted)
     with monkeypatch.context() as patched:
         patched.setattr(module, attribute, count)
         restore(lab, before)
@@ -132,7 +129,7 @@ def tortured(lab, name, kind, monkeypatch, capsys, most):
         restore(lab, before)
         capsys.readouterr()
         with monkeypatch.context() as patched:
-            patched.setattr(module, attribute, Refusing(real, error, at, counted))
+            patched.setattr(module, attribute, Refusing(real, error, at, *counted))
             code = run(name, patched)
         err, found = capsys.readouterr().err, files(lab)
         assert code in ((130,) if isinstance(error, KeyboardInterrupt) else (0, 2)), (at, err)
@@ -153,7 +150,8 @@ def test_whatever_call_is_refused(name, kind, lab, monkeypatch, capsys):
 @pytest.mark.parametrize("kind", CALLS)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_whichever_call_is_refused(name, kind, lab, monkeypatch, capsys):
-    tortured(lab, name, kind, monkeypatch, capsys, COSTLY.get(name, 10_000))
+    most = {"watch": 30, "diagnose": 5}.get(name, 10_000)  # how many calls are refused at most
+    tortured(lab, name, kind, monkeypatch, capsys, most)
 
 
 def test_whatever_the_machine_refuses_results_of_before_stay_and_folders_are_named(lab, monkeypatch, capsys):

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from jax.tree_util import tree_leaves
+from simgap_scenes import HAND
 from simgap_swing import Swing, log
 
 import simgap
 from experiments.generic_ensembles import TASK, ensemble
 from hmmseg.hand.kinematics import inverse
-from hmmseg.io.rig import Finger, Fingertip, Rig
 from hmmseg.io.trial import Trial
 from simgap import channels, effects
 from simgap.effects import catalogue
@@ -34,11 +34,7 @@ quantisation joint_offset link_length backlash clock_jitter fingertip_compliance
 fingertip_mass grip_slip object_inertia offcentre_mass table_tilt table_compliance cable_force
 viscous_drag structural_vibration contact_impact hand_roll actual
 """
-RIG = Rig(fingers={"1": Finger(base=(0.05, 0.17), links=(0.12, 0.12)),
-                   "2": Finger(base=(0.21, 0.17), links=(0.12, 0.12))},
-          fingertip=Fingertip(normal_stiffness=4000.0, shear_stiffness=2500.0))  # fmt: skip
 RNG = np.random.default_rng(0)
-DETERMINISTIC = sorted(n for n, e in catalogue().items() if e.correct is not None)
 PLANTED = {"force_bias": {"fx1": 0.1, "fy1": -0.05, "fx2": 0.02, "fy2": 0.07},
            "force_drift": {"fx1": 0.01, "fy1": 0.0, "fx2": -0.02, "fy2": 0.005, "bend": 0.2},
            "force_gain": {"gain": 0.08}, "force_crosstalk": {"fy_from_fx": 0.06, "fx_from_fy": -0.03},
@@ -58,13 +54,13 @@ def performance(n: int = 400) -> Performance:
     force = np.stack([np.stack([grip, 0.2 * grip], 1), np.stack([-grip, 0.25 * grip], 1)], 1)
     held = (t > 1.2).astype(float)
     load, width = 0.5 * held, np.where(held > 0, 0.02, 1.0)
-    return Performance(t, position, velocity, force, np.array([1.0, 1.2, 1.6, 1.9]), RIG, load, width)
+    return Performance(t, position, velocity, force, np.array([1.0, 1.2, 1.6, 1.9]), HAND, load, width)
 
 
 def world_of(p: Performance) -> World:
     """The world that the nominal hand records of a performance, every tenth sample."""
     k = slice(None, None, 10)
-    joints = np.concatenate([inverse(RIG.finger(i), i, p.position[k, i - 1]) for i in (1, 2)], 1)
+    joints = np.concatenate([inverse(HAND.finger(i), i, p.position[k, i - 1]) for i in (1, 2)], 1)
     rates, held = np.gradient(joints, p.t[k], axis=0), (p.t[k] > 1.0).astype(float)
     carry = ((p.t[k] > 1.2) & (p.t[k] < 1.6)).astype(float)
     one, zero = np.ones(()), np.zeros(())
@@ -83,7 +79,7 @@ def test_every_name_of_the_contract_is_an_effect():
     assert set(catalogue()) == {*CONTRACT.split()}
 
 
-@pytest.mark.parametrize("name", DETERMINISTIC)
+@pytest.mark.parametrize("name", sorted(n for n, e in catalogue().items() if e.correct is not None))
 def test_an_effect_that_is_off_changes_nothing_and_is_finite_where_a_fit_begins(name):
     effect, world = catalogue()[name], world_of(performance())
     out = effect.correct(world, {p.name: p.nominal for p in effect.parameters.values()}, 0.0)
@@ -175,7 +171,6 @@ def test_pads_that_carry_a_block_hold_it_and_quantised_forces_lie_on_the_lattice
     np.testing.assert_allclose(force, [0.02, -0.04, 1.24])
 
 
-PAGE = Path(simgap.__file__).parents[1] / "docs" / "your_effect.md"
 ROOT = Path(simgap.__file__).parent
 # The comparison with given trials and robots have effects of their own, some of the same names.
 CATALOGUES = {ROOT / "generic/effects.py", ROOT / "channels/drives.py"}
@@ -183,7 +178,8 @@ CATALOGUES = {ROOT / "generic/effects.py", ROOT / "channels/drives.py"}
 
 @pytest.fixture
 def step(tmp_path, monkeypatch):
-    (tmp_path / "step.py").write_text(re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0])
+    page = (ROOT.parent / "docs/your_effect.md").read_text()
+    (tmp_path / "step.py").write_text(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[0])
     caches = (channels.channel_effects, effects.catalogue, of_ensembles.effects)
     monkeypatch.setattr(channels, "__path__", [*channels.__path__, str(tmp_path)])
     for cache in caches:

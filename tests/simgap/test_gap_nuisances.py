@@ -164,30 +164,23 @@ def test_a_tared_pads_inertia_is_its_mass_times_acceleration_in_free_motion_and_
         np.testing.assert_allclose(out[..., c][mine], expected, atol=0.02 * np.abs(expected).max())
 
 
-def _moved(world, by):
-    """The world with both fingers' tips moved by (T, N) [m] to the right."""
-    jx, jy = swung(world)
-    turn = np.zeros_like(world.joints)
-    for k in (0, 2):
-        one, two = slice(k, k + 1), slice(k + 1, k + 2)
-        across = jx[..., one] * jy[..., two] - jx[..., two] * jy[..., one]
-        turn[..., one] = by[..., None] * jy[..., two] / across
-        turn[..., two] = -by[..., None] * jy[..., one] / across
-    return world._replace(joints=world.joints + turn)
-
-
 def test_a_block_that_a_moving_hand_takes_along_stays_there(given):
     world, arrays, step = given.frame.world, given.frame.arrays, 4e-4
     x, stands = CHANNELS.index("x"), arrays.phase[0, :, Phase.PICKUP] * arrays.there[0, :, 0] > 0
     mine = np.flatnonzero(stands)[: np.flatnonzero(np.diff(np.flatnonzero(stands)) > 1)[0] + 1]
     at, by = mine[mine.size // 2], np.zeros(world.t.shape)
     by[0, at:] = step
-    left = {}
+    (jx, jy), joints = swung(world), world.joints.copy()
+    for k in (0, 2):  # both fingers' tips move to the right
+        across = jx[..., k] * jy[..., k + 1] - jx[..., k + 1] * jy[..., k]
+        joints[..., k] += by * jy[..., k + 1] / across
+        joints[..., k + 1] -= by * jy[..., k] / across
+    left, moved = {}, world._replace(joints=joints)
     for seen in (0.0, step):
         pushed = arrays.pushed.copy()
         pushed[0, at] += seen
         other = arrays._replace(pushed=pushed)
-        raw, factor, _ = residuals(_moved(world, by), other, given.centre, np.zeros(2), given.noise)
+        raw, factor, _ = residuals(moved, other, given.centre, np.zeros(2), given.noise)
         usual, _, _ = residuals(world, other, given.centre, np.zeros(2), given.noise)
         after = mine[mine > at]  # a filter is off where the step is, and knows it
         left[seen] = float(np.abs(raw - usual)[0, after, x].max())

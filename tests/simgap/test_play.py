@@ -57,17 +57,6 @@ def perform(session):
         session.advance(ms)
 
 
-def check_identified(folder):
-    """The saved trial identifies to the blocks' own properties within its intervals."""
-    rig, task = read_rig(folder / "rig.toml"), read_task(folder / "task.toml")
-    aligned = align([read_trial(folder / "trial_01.csv", rig)], task, rig)
-    assert aligned.segmentations[0].failed is None
-    found = identify_aligned(aligned)
-    for obj, prop in (("block1", "weight"), ("block1", "width"), ("block2", "height")):
-        low, high = np.percentile(found.of(obj, prop), [2.5, 97.5])
-        assert low < getattr(PAPER_BLOCKS[obj], prop) < high
-
-
 @pytest.mark.slow
 def test_a_session_stacks_and_its_trial_identifies_the_blocks(session, tmp_path):
     perform(session)
@@ -75,7 +64,13 @@ def test_a_session_stacks_and_its_trial_identifies_the_blocks(session, tmp_path)
     assert y1 == pytest.approx(PAPER_BLOCKS["block2"].height + PAPER_BLOCKS["block1"].height / 2, abs=2e-4)
     assert abs(x1 - x2) < 2e-3
     session.save(tmp_path)
-    check_identified(tmp_path)
+    rig, task = read_rig(tmp_path / "rig.toml"), read_task(tmp_path / "task.toml")
+    aligned = align([read_trial(tmp_path / "trial_01.csv", rig)], task, rig)
+    assert aligned.segmentations[0].failed is None
+    found = identify_aligned(aligned)
+    for obj, prop in (("block1", "weight"), ("block1", "width"), ("block2", "height")):
+        low, high = np.percentile(found.of(obj, prop), [2.5, 97.5])
+        assert low < getattr(PAPER_BLOCKS[obj], prop) < high
     assert [path.name for path in session.save(tmp_path)][-1] == "trial_02.csv"
     assert not list(tmp_path.glob(".*"))
 

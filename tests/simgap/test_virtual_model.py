@@ -32,35 +32,35 @@ SLIDE = BlockTask({"a": GROUND, "b": GROUND}, (Move("a", GROUND, slide=True), Mo
 
 
 @pytest.fixture(scope="module")
-def performed():
-    return simulate_trials(STACK, HAND, [PAPER_BLOCKS], [7])[0]
+def stacked():
+    return simulate_trials(STACK, HAND, [PAPER_BLOCKS], [3])[0]
 
 
 def places(done):
     return {name: float(done.motion.blocks[0, k, 0]) for k, name in enumerate(STACK.objects)}
 
 
-def test_the_true_motion_gives_the_true_forces_and_a_replay_the_sensors_noise(performed):
+def test_the_true_motion_gives_the_true_forces_and_a_replay_the_sensors_noise(stacked):
     constants = physics(HAND, [PAPER_BLOCKS[name] for name in STACK.objects])
-    motion = performed.motion
-    again = rollout(constants, standing(constants, STACK, places(performed)), jnp.asarray(motion.position),
+    motion = stacked.motion
+    again = rollout(constants, standing(constants, STACK, places(stacked)), jnp.asarray(motion.position),
                     jnp.asarray(motion.velocity), 1e-3, substeps_for(constants, 1e-3))  # fmt: skip
     assert np.sqrt(np.mean((again.force - motion.force) ** 2)) < 2e-3
     assert abs(again.blocks - motion.blocks).max() < 5e-5
-    result = replay(performed.trial, STACK, HAND, PAPER_BLOCKS, boundaries=performed.boundaries)
-    rest = residual_summary(result, performed.boundaries, STATES)
+    result = replay(stacked.trial, STACK, HAND, PAPER_BLOCKS, boundaries=stacked.boundaries)
+    rest = residual_summary(result, stacked.boundaries, STATES)
     assert rest["free-motion"] < 1.15 and rest["hold-above-ground"] < 1.5
     end = result.motion.blocks[-1]
-    np.testing.assert_allclose(end, performed.motion.blocks[-1], atol=2e-3)
+    np.testing.assert_allclose(end, stacked.motion.blocks[-1], atol=2e-3)
 
 
-def test_steps_agree_with_the_rollout_and_reset_starts_over(performed):
-    model = VirtualModel(HAND, STACK, PAPER_BLOCKS, places(performed))
+def test_steps_agree_with_the_rollout_and_reset_starts_over(stacked):
+    model = VirtualModel(HAND, STACK, PAPER_BLOCKS, places(stacked))
     span = slice(1500, 2100)  # the first grasp
-    position, velocity = performed.motion.position[span], performed.motion.velocity[span]
+    position, velocity = stacked.motion.position[span], stacked.motion.velocity[span]
     forces = np.stack([model.step(p, v, 1e-3) for p, v in zip(position, velocity, strict=True)])
     constants = model.physics
-    whole = rollout(constants, standing(constants, STACK, places(performed)), jnp.asarray(position),
+    whole = rollout(constants, standing(constants, STACK, places(stacked)), jnp.asarray(position),
                     jnp.asarray(velocity), 1e-3, substeps_for(constants, 1e-3))  # fmt: skip
     np.testing.assert_allclose(forces, whole.force, atol=1e-9)
     assert abs(forces).max() > 1.0
@@ -107,11 +107,6 @@ def test_smoothing_keeps_a_parabola_averages_a_rest_and_bridges_missing_samples(
 def test_the_virtual_block_is_passive_in_a_delayed_loop(rate):
     found = squeeze(rate, 4000.0, 2e-3, controlled=False, seconds=0.4)
     assert found["returned_J"] < 1e-9 and found["speed_left"] < 0.02
-
-
-@pytest.fixture(scope="module")
-def stacked():
-    return simulate_trials(STACK, HAND, [PAPER_BLOCKS], [3])[0]
 
 
 def test_a_trial_shows_its_task_its_widths_and_heights_and_the_rig_s_noise(stacked):

@@ -101,9 +101,8 @@ def pieces_of(path: str | Path, wanted: Sequence[str], rows: int, least: int) ->
     with _parsing(path):
         for piece in _module(kind_of(file), path).read_pieces(file, wanted, rows):
             if waiting is not None and len(piece.rows) < least:
-                waiting = append(waiting, piece)
-                continue
-            if waiting is not None:
+                piece = append(waiting, piece)
+            elif waiting is not None:
                 yield waiting
             waiting = piece
     if waiting is not None:
