@@ -210,9 +210,8 @@ def diagnose_robot(
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
     with show_stages(out, "diagnosing", STAGES) as tell:
-        forced = tuple(dict.fromkeys(effect))
-        found = diagnose(at_risk, recordings, forced=forced, seed=out.seed, more=more, length=length,
-                         phases=phases, tell=tell, warn=out.warn, note=out.print)  # fmt: skip
+        found = diagnose(at_risk, recordings, forced=tuple(dict.fromkeys(effect)), seed=out.seed, more=more,
+                         length=length, phases=phases, tell=tell, warn=out.warn, note=out.print)  # fmt: skip
     document = body(found)
     warn_of_engine(out, own)
     headline, left = sentence(document), document["remainder"]["rms_over_noise"]

@@ -295,7 +295,8 @@ class Search:
         best, key, starts = None, frozenset(names), {} if near is None else near.linear.starts
         here = (self.composed if near is None else near.composed).moved(begin)
         for whiten in scales:
-            one = self._judge(here, names, self._fit_point(here, begin, whiten, starts))
+            point = fit_effects(here, linearise(here, begin, [], starts), whiten, begin)
+            one = self._judge(here, names, point)
             for _ in range(AGAIN):
                 leading = max((one, *self.fitted.values()), key=lambda known: known.score)
                 before, (there, linear, bend) = one.score, self._begun_anew(one, leading)
@@ -332,11 +333,6 @@ class Search:
         judge = one.covariances.whitener(leading.discrepancy, leading.wide)
         off = judge(np.nan_to_num(anew.residual - linear.residual))
         return there.moved(one.point), anew, 0.5 * float(np.sum(off**2))
-
-    def _fit_point(
-        self, composed: Composed, begin: Point, whiten: Whitener, starts: Mapping[str, np.ndarray]
-    ) -> Point:
-        return fit_effects(composed, linearise(composed, begin, [], starts), whiten, begin)
 
     def _judge(self, composed: Composed, names: Names, point: Point) -> FittedSet:
         """A set at its fitted point, with its discrepancy and its log evidence (Laplace's).

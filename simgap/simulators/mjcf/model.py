@@ -289,14 +289,18 @@ class MjcfSimulator:
         return [float(t) for t, a, b in zip(times[1:], what, what[1:], strict=False) if a != b]
 
     def contact_states(self, recording: Recording) -> tuple[np.ndarray, list[Pairs]]:
-        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch then or next to it."""
-        t, none = recording.t[self._shown(recording)], frozenset[tuple[int, int]]()
-        if not self.touching:
-            return t, [none] * t.size
-        body = self.model.geom_bodyid
-        sets = [frozenset((int(body[a]), int(body[b])) for a, b in one) for one in self.touched(recording)]
+        """Times (n,) [s] along the recorded motion, and the pairs of bodies that touch then or next to it; a
+        joint on a stop that it leaves or reaches counts as a pair, numbered below zero."""
+        rows, none, m = self._shown(recording), frozenset[tuple[int, int]](), self.model
+        touched, body = self.touched(recording) if self.touching else [none] * rows.size, m.geom_bodyid
+        sets = [frozenset((int(body[a]), int(body[b])) for a, b in one) for one in touched]
+        for column, j in self.joints.items():
+            away = np.abs(bridged(recording[column])[rows] - m.jnt_range[j].mean())
+            stopped = (away > 0.5 * np.ptp(m.jnt_range[j])) & bool(m.jnt_limited[j])
+            if not stopped.all():  # what lies on its stop throughout magnifies no error
+                sets = [s | {(~j, ~j)} if on else s for s, on in zip(sets, stopped, strict=True)]
         wide = [a | b | c for a, b, c in zip([none, *sets], sets, [*sets[1:], none], strict=False)]
-        return t, closed(t, wide)
+        return recording.t[rows], closed(recording.t[rows], wide)
 
     def _shown(self, recording: Recording) -> np.ndarray:
         """The samples at which contacts are checked, at most 200 a second."""
