@@ -356,8 +356,20 @@ def _examined(
         share = min(share, shrinkage.fraction)
     elif others is not None and {*causes} - scattering:
         share = 0.0  # the held-out trials show no gap to explain
-    sure = known(share, detected(statistic(f, models, causes)).p_value) if causes else 0.0
+    sure = 0.0
+    if causes and not _is_absurd(f, fitted(f, causes)):
+        sure = known(share, detected(statistic(f, models, causes)).p_value)
     return _Examined(model, explained, causes, sure)
+
+
+def _is_absurd(f: Forms, model: Model) -> bool:
+    """Whether a parameter of a set is at a bound that no hand reaches; its neutral value is possible."""
+    for j, own in coordinates(f, model.effects).items():
+        c = f.gap.candidates[j]
+        moved = ~np.isclose(c.scale * model.x[own], 0.0, atol=1e-6)
+        if (model.at_bound[own] & moved & ~np.isin(c.parameters, c.hidden)).any():
+            return True
+    return False
 
 
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
