@@ -263,12 +263,12 @@ def _explained(
     h: Record, known: np.ndarray, x: Record, chain: Chain, span: Record, pads: Pads, gravity: float
 ) -> float:
     """Log-likelihood of a reading in the hypothesis's own state, ringing while the contact settles."""
-    kind, block, blocks = chain.kinds[h.state], chain.blocks[h.state], chain.num_blocks
+    kind, block = chain.kinds[h.state], chain.blocks[h.state]
     if kind == FREE_KIND:
         return free(h, x, span)
     settled = _settled(x.t - h.entered[0])
     if kind == ABOVE_KIND:
-        own = lifted(h, known, block, blocks, x, span, gravity, settled)
+        own = lifted(h, known, block, x, span, gravity, settled)
     else:
         own = supported(h, known, kind, block, x, span, pads, h.state < chain.num_steps)
     ringing = RINGING * (1.0 - settled)
@@ -276,9 +276,9 @@ def _explained(
         if kind == ABOVE_KIND:
             other = supported(h, known, SLIDING_KIND, block, x, span, pads, False)
         else:
-            other = lifted(h, known, block, blocks, x, span, gravity, settled)
+            other = lifted(h, known, block, x, span, gravity, settled)
         own = log_sum(math.log1p(-ringing) + own, math.log(ringing) + max(own, other))
-    return own + held(h, known, block, blocks, x, span, pads)
+    return own + held(h, known, block, x, span, pads)
 
 
 @compiled

@@ -174,11 +174,9 @@ def widen(extremes: np.ndarray, ranges: np.ndarray, least: np.ndarray, x: Any) -
 STILL = 0.2  # prior: share of samples at which a moving hand stands still
 CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
 JUST_LIFTED = 0.05  # prior: factor of STILL while a lift begins: slow, but a motion
-ALIKE = 0.5  # prior: probability that a new block resembles an earlier one
 _LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
 _LOG_MOVING, _LOG_STILL = math.log1p(-STILL), math.log(STILL)
-_ROOT2 = math.sqrt(2.0)  # numerics: computed once
 
 
 @compiled
@@ -186,19 +184,6 @@ def log_sum(a: float, b: float) -> float:
     """log(exp(a) + exp(b))."""
     high, low = (a, b) if a > b else (b, a)
     return high + math.log1p(math.exp(low - high)) if low > -math.inf else high
-
-
-@compiled
-def _log_rising(value: float, scale: float, span: float) -> float:
-    """Log density of value = w + noise (sd `scale`), with w of a density that rises from 0 to `span`.
-
-    The integral of 2 w / span^2 times the normal density over w > 0 is
-    2 (v Phi(v / s) + s phi(v / s)) / span^2.
-    """
-    z = value / scale
-    tail = math.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)
-    share = z * 0.5 * math.erfc(-z / _ROOT2) + tail if z > -5.0 else tail / (z * z)
-    return math.log(2 * scale / span) - math.log(span) + max(math.log(max(share, 1e-300)), EDGE)
 
 
 @compiled
@@ -269,33 +254,23 @@ def _ungripped(h: Record, x: Record, span: float) -> float:
 
 @compiled
 def _log_known(
-    value: float, factor: float, known: np.ndarray, q: int, others: int, variance: float, share: float,
-    span: float, rising: bool
+    value: float, factor: float, known: np.ndarray, q: int, variance: float, share: float, span: float,
+    positive: bool
 ) -> float:  # fmt: skip
     """Log density of value = factor x quantity `q` given the evidence `known`; broad if unknown.
 
-    An unknown quantity may resemble that of the `others`. `rising`: its density rises from 0, as a block has
-    weight.
+    `positive`: it is positive, as a weight is.
     """
     if math.isnan(value):
         return 0.0
     precision = known[q, 1]
-    if precision > 0.0:
-        mean = known[q, 0] / precision
-        if rising:
-            mean = max(mean, 0.0)
-        close = log_student(value - factor * mean, math.sqrt(variance + factor * factor / precision))
-        return log_sum(math.log1p(-share) + close, math.log(share) - math.log(span)) if share > 0 else close
-    flat = _log_rising(value, math.sqrt(variance), span) if rising else -math.log(span)
-    met, alike = 0, -math.inf
-    for o in range(q % 2, 2 * others, 2):
-        if known[o, 1] > 0.0:
-            met += 1
-            total = variance + factor * factor / known[o, 1]
-            alike = log_sum(alike, log_student(value - factor * known[o, 0] / known[o, 1], math.sqrt(total)))
-    if met == 0:
-        return flat
-    return log_sum(math.log(1 - ALIKE) + flat, math.log(ALIKE / met) + alike)
+    if precision <= 0.0:
+        return log_between(value, 0.0, span, math.sqrt(variance)) if positive else -math.log(span)
+    mean = known[q, 0] / precision
+    if positive:
+        mean = max(mean, 0.0)
+    close = log_student(value - factor * mean, math.sqrt(variance + factor * factor / precision))
+    return log_sum(math.log1p(-share) + close, math.log(share) - math.log(span)) if share > 0 else close
 
 
 @compiled
@@ -339,9 +314,7 @@ def free(h: Record, x: Record, span: Record) -> float:
 
 
 @compiled
-def held(
-    h: Record, known: np.ndarray, block: int, num_blocks: int, x: Record, span: Record, pads: Pads
-) -> float:
+def held(h: Record, known: np.ndarray, block: int, x: Record, span: Record, pads: Pads) -> float:
     """Log-likelihood of the features of a reading common to all grips of this block."""
     fx1, fx2 = _force(h, x, 0), _force(h, x, 2)
     out = log_between((fx1 - fx2) / 2, 0.0, span.force, math.sqrt(_square(h, FORCE)))
@@ -351,13 +324,12 @@ def held(
     out += log_student((_force(h, x, 1) - _force(h, x, 3)) / 2, math.sqrt(_square(h, SHEAR)))
     spread = x.sd_d * x.sd_d + _square(h, WIDTH)
     width = _held_width(h, x, pads)
-    return out + _log_known(width, 1.0, known, 2 * block + 1, num_blocks, spread, TOUCHING, span.d, False)
+    return out + _log_known(width, 1.0, known, 2 * block + 1, spread, TOUCHING, span.d, False)
 
 
 @compiled
 def lifted(
-    h: Record, known: np.ndarray, block: int, num_blocks: int, x: Record, span: Record, gravity: float,
-    settled: float
+    h: Record, known: np.ndarray, block: int, x: Record, span: Record, gravity: float, settled: float
 ) -> float:  # fmt: skip
     """Log-likelihood of the remaining features, of a block above the ground.
 
@@ -365,7 +337,7 @@ def lifted(
     """
     factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
     fy = _force(h, x, 1) + _force(h, x, 3)
-    out = _log_known(fy, factor, known, 2 * block, num_blocks, _carry(h, x), 0.0, span.force, True)
+    out = _log_known(fy, factor, known, 2 * block, _carry(h, x), 0.0, span.force, True)
     return out + _moves(h, x, span, STILL * max(settled, JUST_LIFTED), 0.0)
 
 

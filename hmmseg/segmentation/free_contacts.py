@@ -170,9 +170,8 @@ def fit_free_contacts(f: Features, sliding: bool) -> FreeContacts:
     interval = float(np.median(np.diff(f.t)))
     tapped = _tapped(states, path, interval, f)
     taps = tuple((float(f.t[span][0] - interval / 2), float(f.t[span][-1] + interval / 2)) for span in tapped)
-    opened = _opened(f, states, path, parameters.bias)
     ringing = log_likelihoods(f, _subtasks(states[:1]), replace(parameters, levels=()), 0, rung=RINGING)[:, 0]
-    lowered, slides = _put_down(f, states, path, parameters)
+    opened, lowered, slides = _ends(f, states, path, parameters)
     ringing[slides] = np.logaddexp(ringing[slides], np.log(RINGING) + table[slides].max(axis=1))
     for span in tapped:
         table[span], ringing[span], path[span] = 0.0, 0.0, 0
@@ -252,44 +251,33 @@ def _unweighed(states: States, path: np.ndarray, blocks: tuple[Block, ...]) -> t
     return tuple(kept)
 
 
-def _opened(f: Features, states: States, path: np.ndarray, bias: np.ndarray) -> np.ndarray:
-    """Log-likelihoods (num_timesteps,) of the fingers' distance if they release a block that stays in place.
+def _ends(f: Features, states: States, path: np.ndarray, p: Parameters) -> tuple[np.ndarray, ...]:
+    """What tells a block that is set down and released from one that falls, three arrays (num_timesteps,).
 
-    Pads relax before they leave a block, so the fingers are then as far apart as it is wide; if they are no
-    farther apart than while holding, the block has gone. Half the nominal give of the pads suffices, as they
-    may be stiffer. Relative to the density of any distance; 0 where nothing is known.
-    """
-    held = np.array([state != FREE for state, _ in states])[path]
-    given = f.block_width(bias) - f.d
-    least = np.full(f.t.size, -np.inf)
-    for start, stop in runs(held):
-        grip = slice(start, stop)
-        least[start:] = median_of_known(f.d[grip], -np.inf) + median_of_known(given[grip], 0.0) / 2
-    chance = log_ndtr(np.where(np.isfinite(f.d), (f.d - least) / f.sd_d, np.inf))
-    return np.logaddexp(np.log1p(-CLOSED) + chance, np.log(CLOSED))
-
-
-def _put_down(f: Features, states: States, path: np.ndarray, p: Parameters) -> tuple[np.ndarray, np.ndarray]:
-    """What tells a carried block that is set down from one that falls, both (num_timesteps,).
-
-    First, log-likelihoods of its height if it meets a support, relative to those of any motion: a block comes
-    down on its support, which one that still is where it was carried (STILL) has not. Second, samples at
-    which it may slide out of opening fingers: it still loads them then, for their grip more than while
-    carried. A support takes the load before the grip goes.
+    Log-likelihoods of the fingers' distance if they release a block that stays in place: pads relax before
+    they leave it; if the fingers are no farther apart than while holding, it has gone. (Half the nominal give
+    of the pads suffices, as they may be stiffer.) Those of the height of a carried block that meets a
+    support: it has come down, unless it stays where it was carried (STILL). Both are relative to any distance
+    or height. And samples at which it may slide out of opening fingers, which it loads more, for their grip,
+    than while carried; a support takes the load before the grip goes.
     """
     load = np.abs(filled(f.force[:, 1] + f.force[:, 3] - p.bias[1] - p.bias[3]))
     grip, height = filled(f.grip - (p.bias[0] - p.bias[2]) / 2), f.block_y(p.bias)
-    state, slides, level = np.array([state for state, _ in states])[path], load > np.inf, np.nan * load
-    least = SURE * np.sqrt(2) * p.scale["force"]
+    given, noise = f.block_width(p.bias) - f.d, SURE * np.sqrt(2) * p.scale["force"]
+    state, slides = np.array([state for state, _ in states])[path], np.zeros(load.size, bool)
+    least, level = np.full(load.size, -np.inf), np.full(load.size, np.nan)
     for start, stop in runs(state != FREE):
-        carried = start + np.flatnonzero(state[start:stop] == ABOVE_GROUND)
-        slides[start:] = False
+        held, slides[start:] = slice(start, stop), False
+        least[start:] = median_of_known(f.d[held], -np.inf) + median_of_known(given[held], 0.0) / 2
+        carried = start + np.flatnonzero(state[held] == ABOVE_GROUND)
         if carried.size:
             weight, firm = np.median(load[carried]), np.median(grip[carried])
-            slides[start:] = firm * (load[start:] - least) > weight * grip[start:]
-            level[start:stop] = np.quantile(height[carried], HIGH)
+            slides[start:] = firm * (load[start:] - noise) > weight * grip[start:]
+            level[held] = np.quantile(height[carried], HIGH)
+    chance = log_ndtr(np.where(np.isfinite(f.d), (f.d - least) / f.sd_d, np.inf))
     aloft = np.log(STILL * f.span["y"]) + log_student(level - height, np.sqrt(2) * f.sd_y)
-    return np.where(np.isfinite(level - height), -np.logaddexp(np.log1p(-STILL), aloft), 0.0), slides
+    lowered = np.where(np.isfinite(level - height), -np.logaddexp(np.log1p(-STILL), aloft), 0.0)
+    return np.logaddexp(np.log1p(-CLOSED) + chance, np.log(CLOSED)), lowered, slides
 
 
 def _tapped(states: States, path: np.ndarray, interval: float, f: Features) -> list[slice]:

@@ -80,12 +80,12 @@ def test_emissions_are_those_off_line():
             if step.state == FREE:
                 found, halt = one.free(h, x, span), one.STILL
             else:
-                found, halt = one.held(h, known, 0, 2, x, span, f.pads), 0.0
+                found, halt = one.held(h, known, 0, x, span, f.pads), 0.0
                 if step.state == ON_GROUND:
                     found += one.supported(h, known, one.GROUND_KIND, 0, x, span, f.pads, step.index == 1)
                 else:
                     assert step.state == ABOVE_GROUND
-                    found += one.lifted(h, known, 0, 2, x, span, f.gravity, 0.0)
+                    found += one.lifted(h, known, 0, x, span, f.gravity, 0.0)
                     halt = one.STILL * one.JUST_LIFTED
             aside, upward = one._halting(h, x, span)
             more = aside + upward
