@@ -16,7 +16,6 @@ from simgap.robot_effects.base import Setting  # noqa: E402
 from simgap.robots.model import Composed  # noqa: E402
 from simgap.robots.patch import patched  # noqa: E402
 from simgap.robots.rows import noises  # noqa: E402
-from simgap.robots.windows import STRIKES, cut  # noqa: E402
 from simgap.simulators.mjcf.engine import warned  # noqa: E402
 from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
 from simgap.simulators.mjcf.map import proposed_map  # noqa: E402
@@ -445,22 +444,6 @@ def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files, 
     at_rest = found.simulator._states([still], (("joint:right.tie", tie),))[0]
     assert abs(at_rest[1] - at_rest[2]) < 0.1 * abs(left - right)
     np.testing.assert_allclose(state, [left, right, rate, other], atol=0.02 * abs(left - right))
-
-
-def test_a_stop_that_is_reached_and_left_is_a_contact_and_one_that_is_never_left_is_none(files):
-    """A swing of 3.2 rad in a range of 3 is beyond it where |sin| exceeds 3 / 3.2."""
-    simulator, t = load_mjcf(*files()).simulator, np.arange(0, 4, 0.005)
-    swing = Recording("a.csv", t, {"q": 3.2 * np.sin(3 * t), "u": np.zeros(t.size)})
-    times, what = simulator.contact_states(swing)
-    beyond = np.abs(np.sin(3 * times)) > 3 / 3.2
-    near = np.abs(np.sin(3 * times)) > 3 / 3.2 - 0.01
-    touching = np.array([bool(pairs) for pairs in what])
-    assert beyond.any() and touching[beyond].all() and not touching[~near].any()
-    windows = cut(simulator, [swing], {"q": 1e-4})
-    struck = [np.abs(swing["q"][w.begin : w.end]).max() > 3 for w in windows]
-    assert [w.regime == STRIKES for w in windows] == struck and any(struck) and not all(struck)
-    lies = Recording("b.csv", t, {"q": np.full(t.size, 3.01), "u": np.zeros(t.size)})
-    assert not any(simulator.contact_states(lies)[1]) and not simulator.contacts(lies)
 
 
 def test_a_joint_pushed_on_past_a_stop_starts_where_it_came_to_rest(files):

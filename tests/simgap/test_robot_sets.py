@@ -385,6 +385,29 @@ def test_flight_and_contact_are_told_apart(dropped):
     assert {*names} == {w.regime for w in windows} and all(names == np.array(REGIMES)[rows.regime])
 
 
+def test_a_stop_that_is_reached_and_left_is_a_contact_and_one_that_is_never_left_is_none(tmp_path):
+    """A swing of 3.2 rad in a range of 3 is beyond it where |sin| exceeds 3 / 3.2."""
+    pytest.importorskip("mujoco")
+    from simgap.simulators.mjcf.load import load_mjcf
+
+    body = '<joint name="j" range="-3 3"/><geom size=".1" pos="0 0 -1"/>'
+    xml = f'<mujoco><compiler angle="radian"/><worldbody><body>{body}</body></worldbody></mujoco>'
+    (tmp_path / "swing.xml").write_text(xml, encoding="utf-8")
+    (tmp_path / "map.toml").write_text('[columns.q]\njoint = "j"\n', encoding="utf-8")
+    simulator = load_mjcf(tmp_path / "swing.xml", tmp_path / "map.toml").simulator
+    t = np.arange(0, 4, 0.005)
+    swing = Recording("a.csv", t, {"q": 3.2 * np.sin(3 * t)})
+    times, what = simulator.contact_states(swing)
+    beyond, near = (np.abs(np.sin(3 * times)) > 3 / 3.2 - by for by in (0.0, 0.01))
+    touching = np.array([bool(pairs) for pairs in what])
+    assert beyond.any() and touching[beyond].all() and not touching[~near].any()
+    windows = cut(simulator, [swing], {"q": 1e-4})
+    struck = [np.abs(swing["q"][w.begin : w.end]).max() > 3 for w in windows]
+    assert [w.regime == STRIKES for w in windows] == struck and any(struck) and not all(struck)
+    lies = Recording("b.csv", t, {"q": np.full(t.size, 3.01)})
+    assert not any(simulator.contact_states(lies)[1]) and not simulator.contacts(lies)
+
+
 def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     """Windows that admit that each impact differs by a usual size: their weight on the scale is small."""
     simulator, log = dropped
