@@ -221,6 +221,19 @@ def test_two_effects_one_or_none_are_told_and_nothing_remains_of_a_gap_once_expl
     assert found.remainder.share == 0.0 and found.remainder.p_value > 0.01
 
 
+def test_a_cause_at_a_bound_that_no_hand_reaches_is_held_back():
+    gap = gap_of({0: 3.0})
+    first, *rest = gap.candidates
+
+    def verdict(**bounds):
+        own = replace(first, **{name: np.full(1, value) for name, value in bounds.items()})
+        return attribute(replace(gap, candidates=(own, *rest)), heldout=False).verdict
+
+    assert verdict(low=-2.0, high=3.5) == "named" and verdict(high=2.0) == "unknown"
+    hidden = replace(first, high=np.full(1, 2.0), hidden=first.parameters)
+    assert attribute(replace(gap, candidates=(hidden, *rest)), heldout=False).verdict == "named"
+
+
 def test_a_tolerant_prior_leaves_what_matters_as_likely_and_rounding_no_probability_above_one():
     alone = fitted(forms(gap_of({1: 9.0})), (1,))
     each = next(w for w in (search.weights([alone] * n) for n in range(2, 99)) if sum(w) > 1.0)
