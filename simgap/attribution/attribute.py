@@ -363,11 +363,15 @@ def _examined(
 
 
 def _is_absurd(f: Forms, model: Model) -> bool:
-    """Whether a parameter of a set is at a bound that no hand reaches; its neutral value is possible."""
+    """Whether a parameter of a set is at a bound that no hand reaches.
+
+    Its neutral value is possible, and times or frequencies end where recordings tell no more of them.
+    """
     for j, own in coordinates(f, model.effects).items():
         c = f.gap.candidates[j]
-        moved = ~np.isclose(c.scale * model.x[own], 0.0, atol=1e-6)
-        if (model.at_bound[own] & moved & ~np.isin(c.parameters, c.hidden)).any():
+        reached = model.at_bound[own] & ~np.isclose(c.scale * model.x[own], 0.0, atol=1e-6)
+        linear = np.ones(own.size, bool) if c.size is None else np.isnan(c.size)
+        if (reached & linear & ~np.isin(c.parameters, c.hidden)).any():
             return True
     return False
 
