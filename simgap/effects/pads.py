@@ -38,10 +38,9 @@ FINGERS = ("give_normal1", "give_normal2", "give_shear1", "give_shear2")
 
 def _correct_fingertip_compliance(world: World, values: Values, on: Array) -> World:
     each = np.array([values[n] for n in FINGERS])
-    return world._replace(
-        give_normal=world.give_normal * (1 + values["softness"]) + values["give_normal"] + each[:2],
-        give_shear=world.give_shear * (1 + values["softness"]) + values["give_shear"] + each[2:],
-    )
+    normal = world.give_normal * (1 + values["softness"]) + values["give_normal"] + each[:2]
+    shear = world.give_shear * (1 + values["softness"]) + values["give_shear"] + each[2:]
+    return world._replace(give_normal=np.maximum(normal, 0.0), give_shear=np.maximum(shear, 0.0))
 
 
 def _report_fingertip_compliance(draws: dict[str, Any], rig: Rig) -> dict[str, Any]:
@@ -99,10 +98,7 @@ FINGERTIP_COMPLIANCE = HandEffect(
     called="other fingertips than the model's",
     check="Press a fingertip against a scale and plot force over travel; look for worn or replaced pads.",
     phrase=_phrase_fingertip_compliance,
-    parameters={
-        n: Parameter(0.0, 4e-4, "m/N", low=-2.4e-4 if "normal" in n else -3.8e-4)
-        for n in ("give_normal", "give_shear", *FINGERS)
-    }
+    parameters={n: Parameter(0.0, 4e-4, "m/N") for n in ("give_normal", "give_shear", *FINGERS)}
     | {"softness": SOFTNESS},
     forms=(("give_normal", "give_shear"), FINGERS, ("softness",)),
     stage=CONTACT,
