@@ -53,11 +53,7 @@ def held_back(one: Mapping[str, Any]) -> bool:
 
 
 def covered(one: Mapping[str, Any]) -> list[bool]:
-    """Whether intervals contain the sizes of rightly named faults, where the cause has that parameter.
-
-    A cause that accounts for two of them, as a delay for that of commands and that of readings, has their
-    sum.
-    """
+    """Whether intervals contain the sizes of rightly named faults; of two delays told as one, the sum."""
     out, effects, named = [], one["found"]["effects"], one["found"]["causes"]
     same = {"delay": "delay", "read_gain": "gain", "read_bias": "bias", "read_lag": "delay", "gain": "gain"}
     accounts = [next((name for name in f["right"] if name in named), None) for f in one["faults"]]
