@@ -136,10 +136,11 @@ class HandEffect(Effect):
 
     Its action: `correct(world, values, on)` corrects a recording; `on` is 1 if the effect is in the
     candidate, else 0, for parameters without a neutral value. `scatter(problem, residual)` gives the variance
-    of a random disturbance instead (a `simgap.gap.assemble.Scatter`). `apply(performance, values, rng)`
-    applies it to simulated truth, `scene(values)` changes the scene before simulation, `sampled(t, values,
-    rng)` gives the true times of samples stamped t, and `finish(force, values)` acts on recorded forces
-    including noise. `restored(channels, values)` removes the effect from recorded channels.
+    of a random disturbance instead (a `simgap.gap.assemble.Scatter`), from a residual with its nuisances.
+    `apply(performance, values, rng)` applies it to simulated truth, `scene(values)` changes the scene before
+    simulation, `sampled(t, values, rng)` gives the true times of samples stamped t, and `finish(force,
+    values)` acts on recorded forces including noise. `restored(channels, values)` removes the effect from
+    recorded channels.
 
     Its forms: in each of `forms` the listed parameters are free and the others neutral, the usual form first;
     by default all are free. `admitted(rig)` is the key of a form with standard deviations by parameter, as
