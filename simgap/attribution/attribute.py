@@ -358,7 +358,9 @@ def _examined(
         share = 0.0  # the held-out trials show no gap to explain
     sure = 0.0
     if causes and not _is_absurd(f, fitted(f, causes)):
-        sure = known(share, detected(statistic(f, models, causes)).p_value)
+        part = explained.each.mean(0) + 1e-9
+        form = np.sqrt(part @ np.square([f.gap.candidates[j].form for j in effects]) / part.sum())
+        sure = known(share, detected(statistic(f, models, causes)).p_value, form)
     return _Examined(model, explained, causes, sure)
 
 

@@ -20,12 +20,15 @@ from simgap.bounded import least
 # The background: what no candidate explains, a variance of its own for each group of rows.
 #
 # The rows of a group (a channel in a part, in a band) have variance phi, usually one. The prior of log phi is
-# normal, as stated noise is a little off, and with some probability log-uniform above that: there the model
-# is off for reasons of its own. Averaged over phi, the log density of a group grows only with the logarithm
-# of its squares, so that no group decides alone (a scale mixture of normals: West, Biometrika 74, 1987).
+# normal, as stated noise is a little off, and in some groups log-uniform above that: there the model is off
+# for reasons of its own. Averaged over phi, the log density of a group grows only with the logarithm of its
+# squares, so that no group decides alone (a scale mixture of normals: West, Biometrika 74, 1987). In how many
+# groups the model is off is unknown: a set of effects that leaves none of them off has that for it (Scott &
+# Berger, Ann. Stat. 38, 2010).
 
 STATED = 0.3  # prior: sd of log variance about the stated one: noise is stated to 15 %
-OFF = 0.1  # prior: share of groups in which the model is off
+# prior: shares of groups in which the model is off, equally likely: a gap may be confined to one place
+OFF = (0.002, 0.01, 0.03, 0.1)
 WITHIN = 0.5  # prior: share of groups that are off, of those that an effect frees
 NEAR, FAR = 13, 20  # numerics: points of the grid
 NEAR_BY = 3.5 * STATED  # numerics: log variance that separates the two parts of the grid
@@ -34,35 +37,31 @@ LARGEST = 1e6  # numerics: largest variance over the stated one
 
 @dataclass(frozen=True)
 class Background:
-    """A grid of log variances (grid,) and the logarithms of their prior weights (grid,)."""
+    """A grid of log variances (grid,), their prior weights (grid,) near the stated ones and where the model
+    is off, and the shares `off` (S,) of groups in which it may be.
+    """
 
     log_phi: np.ndarray
-    log_prior: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+    off: np.ndarray
 
     @classmethod
-    def usual(cls, off: float = OFF) -> Background:
-        """Noise about as stated, or the model off."""
+    def usual(cls, *off: float) -> Background:
+        """Noise about as stated, or the model off, in shares OFF of the groups unless others are given."""
         grid = np.concatenate(
             [np.linspace(-3, 3, NEAR) * STATED, np.linspace(4 * STATED, np.log(LARGEST), FAR)]
         )
-        normal = -0.5 * (grid[:NEAR] / STATED) ** 2
-        log_prior = np.concatenate([
-            np.log(1 - off) + normal - np.logaddexp.reduce(normal), np.full(FAR, np.log(off / FAR)),
-        ])  # fmt: skip
-        return cls(grid, log_prior)
+        far = np.arange(grid.size) >= NEAR
+        normal = np.where(far, 0.0, np.exp(-0.5 * (grid / STATED) ** 2))
+        return cls(grid, normal / normal.sum(), far / FAR, np.array(off or OFF))
 
     def tolerant(self, most: np.ndarray) -> np.ndarray:
-        """Log prior (grid, G) of groups whose variance may as well be as large as `most` (G,)."""
+        """Weights (grid, G) near the stated variance if it may as well be as large as `most` (G,)."""
         inside = (self.log_phi[:, None] > NEAR_BY) & (self.log_phi[:, None] <= np.log(most))
         number = inside.sum(0)
         share = np.where(number > 0, WITHIN, 0.0)
-        # Larger variances keep their prior.
-        usual = self.log_phi <= NEAR_BY
-        taken = share * np.exp(self.log_prior[usual]).sum()
-        with np.errstate(divide="ignore"):
-            more = np.log(np.where(inside, taken / np.maximum(number, 1), 0.0))
-        less = np.where(usual[:, None], np.log1p(-share), 0.0)
-        return np.logaddexp(self.log_prior[:, None] + less, more)
+        return (1 - share) * self.near[:, None] + share * inside / np.maximum(number, 1)
 
     def marginal(
         self,
@@ -80,16 +79,18 @@ class Background:
             most: Variance (G,) that is as likely as the stated one; None for the usual prior.
 
         Returns:
-            Log density (G,) up to (2 pi)^(-count/2), and expected precision (G,).
+            Log density (S, G) up to (2 pi)^(-count/2), and expected precision (S, G), for each of the shares.
         """
         log_phi = self.log_phi[:, None] + shift
         precision = np.exp(-log_phi)
-        prior = self.log_prior[:, None] if most is None else self.tolerant(most)
-        each = prior - 0.5 * (count * log_phi + energy * precision)
+        each = -0.5 * (count * log_phi + energy * precision)
         peak = each.max(axis=0)
-        weight = np.exp(each - peak)
-        total = weight.sum(axis=0)
-        return peak + np.log(total), (weight * precision).sum(axis=0) / total
+        chance = np.exp(each - peak)
+        near = chance * (self.near[:, None] if most is None else self.tolerant(most))
+        far, off = chance * self.far[:, None], self.off[:, None]
+        total = (1 - off) * near.sum(0) + off * far.sum(0)
+        expected = (1 - off) * (near * precision).sum(0) + off * (far * precision).sum(0)
+        return peak + np.log(total), expected / total
 
 
 # What sensor noise adds to the products of a gap's columns, to be subtracted again.
@@ -220,30 +221,24 @@ class Forms:
                 out[j] = np.bincount(self.spectrum.group, value, self.count.size) / self.count
         return out
 
-    def marginal(
-        self, effects: tuple[int, ...], energy: np.ndarray, background: Background | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (G,) of groups with these sums of squares, and their expected precisions (G,).
+    def marginal(self, effects: tuple[int, ...], energy: np.ndarray) -> tuple[float, np.ndarray]:
+        """Log density of all groups with these sums of squares (G,), and their expected precisions (G,).
 
         An effect frees all of its groups or none, with equal prior probability.
-
-        Args:
-            effects: The set that acts.
-            energy: Sum of squares (G,) of each group.
-            background: Prior of the groups' variances, if not the usual one.
         """
-        shift, background = self.shift(effects), background or self.background
+        shift, background = self.shift(effects), self.background
         density, precision = background.marginal(energy, self.count, shift)
+        total = density.sum(1)
         more = self.freed[list(effects)].sum(0)
         freed = more > 0
         if freed.any():
-            own = background.marginal(energy, self.count, shift, 1 + more)
-            bound, loose = float(density[freed].sum()), float(own[0][freed].sum())
-            share = float(expit(loose - bound))
-            precision = np.where(freed, share * own[1] + (1 - share) * precision, precision)
-            both = np.logaddexp(bound, loose) - np.log(2.0)
-            density = np.where(freed, both / freed.sum(), density)
-        return density, precision
+            own = background.marginal(energy[freed], self.count[freed], shift[freed], 1 + more[freed])
+            bound, loose = density[:, freed].sum(1), own[0].sum(1)
+            share = expit(loose - bound)[:, None]
+            precision[:, freed] = share * own[1] + (1 - share) * precision[:, freed]
+            total += np.logaddexp(bound, loose) - np.log(2.0) - bound
+        whole = float(np.logaddexp.reduce(total))
+        return whole - float(np.log(total.size)), np.exp(total - whole) @ precision
 
     @cached_property
     def log_odds(self) -> float:
@@ -354,7 +349,7 @@ def mode(f: Forms, taken: QuadraticForms, precision: np.ndarray, steps: int = ST
         for _ in range(HALVINGS):
             energy = taken.energy(x)
             density, precision = f.marginal(taken.effects, energy)
-            value = float(density.sum()) + _log_prior(x, z, taken.blocks)
+            value = density + _log_prior(x, z, taken.blocks)
             if value > last - CLOSE:
                 break
             x = (before + x) / 2
@@ -406,7 +401,7 @@ def screened(f: Forms, model: Model, sets: Sequence[tuple[int, ...]]) -> np.ndar
         found.append(_log_prior(x, z, blocks) + _volume(matrix, ~held, z) + _log_prior_odds(f, effects))
     energy = _energies(f, model, sets, combined)
     each = zip(sets, energy, strict=True)
-    return np.array(found) + [f.marginal(effects, mine)[0].sum() for effects, mine in each]
+    return np.array(found) + [f.marginal(effects, mine)[0] for effects, mine in each]
 
 
 def _energies(f: Forms, model: Model, sets: Sequence[tuple[int, ...]], combined: np.ndarray) -> np.ndarray:

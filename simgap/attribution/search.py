@@ -112,8 +112,6 @@ def weights(models: list[Model]) -> np.ndarray:
 # Vovk & Wang, Ann. Stat. 49, 2021). No model is exactly right: where there are healthy recordings, their
 # statistics tell by how much the bound is off (conformal rank: Besag & Clifford, Biometrika 78, 1991).
 
-# prior: further shares of groups in which the model is off: a gap may be confined to one place
-RARE = (0.002, 0.01, 0.03)
 ENOUGH = 4  # cited: healthy ones as extreme after which a p-value is clear (Besag & Clifford's h)
 SURE = 1e-6  # chosen: p-value that is clear even if the next one were twice as extreme as those before
 
@@ -147,14 +145,8 @@ def statistic(f: Forms, models: list[Model] | None = None, acting: tuple[int, ..
     models = sought(f) if models is None else models
     wider = [m for m in models if {*acting} <= {*m.effects}]
     wider += [] if any(m.effects == acting for m in wider) else [fitted(f, acting)]
-    null = fitted(replace(f, background=Background.usual(off=1e-9)), acting).score
-    usual = [f.marginal(m.effects, m.energy)[0].sum() for m in wider]
-    scores = [m.score for m in wider]
-    for share in RARE:
-        other = Background.usual(off=share)
-        scores += [m.score + float(f.marginal(m.effects, m.energy, other)[0].sum() - now)
-                   for m, now in zip(wider, usual, strict=True)]  # fmt: skip
-    return float(np.logaddexp.reduce(scores) - np.log(len(RARE) + 1) - null)
+    null = fitted(replace(f, background=Background.usual(1e-9)), acting).score
+    return float(np.logaddexp.reduce([m.score for m in wider]) - null)
 
 
 def clear(value: float, most: float) -> bool:

@@ -15,7 +15,7 @@ from scipy.special import expit
 from scipy.stats import chi2, false_discovery_control, norm
 
 from simgap.attribution.posterior import Forms, Model, squares_left
-from simgap.attribution.problem import Rows
+from simgap.attribution.problem import MODELLED, Rows
 from simgap.attribution.search import Detection
 
 ALARM = 0.01  # chosen: probability that a healthy recording raises an alarm
@@ -24,7 +24,6 @@ ALARM = 0.01  # chosen: probability that a healthy recording raises an alarm
 # lacks passes for what it has, with no sign of it
 RECORD = 0.82
 MOST = 0.5  # cited: share of the gap left above which it is unknown (the interface's definition)
-WIDTH = 0.25  # chosen: scale of the logistic function of that share's logarithm
 # chosen: negligible share of the gap; an error of a tenth in a form leaves half of it
 LEAST = 0.02
 RULED_OUT = 20.0  # chosen: odds against a set at which it is no alternative
@@ -158,18 +157,22 @@ def acting(sets: Sequence[Explanation], p_value: float, record: float = RECORD) 
     return {name: min(value, 1.0) for name, value in out.items()}  # rounding of the sum
 
 
-def known(explained: float, p_rest: float = 0.0) -> float:
-    """Probability that a set's effects are the cause: they leave little of the gap.
+def known(explained: float, p_rest: float = 0.0, form: float = MODELLED) -> float:
+    """Probability that a set's effects are the cause, from the share of the gap that they leave.
 
-    Logistic in the logarithm of the share left, as far as anything is left at all: of a small gap no share is
-    certain.
+    If they are, what is left is as large as their forms are wrong: its amplitude over the gap's has a
+    half-Cauchy distribution of scale `form`. What the catalogue lacks and they imitate leaves any share
+    alike.
 
     Args:
         explained: Share of the gap that the set explains, also on held-out trials.
         p_rest: Probability that what is left is noise.
+        form: Usual relative error of the effects' forms.
     """
-    most = expit(np.log(MOST / max(1 - explained, 1e-6)) / WIDTH)
-    return float(1 - (1 - healthy(p_rest)) * (1 - most))
+    left = np.sqrt(max(1 - explained, 0.0))
+    right = RECORD * 2 / (np.pi * form * (1 + (left / form) ** 2))
+    imitated = (1 - RECORD) * 2 * left
+    return float(1 - (1 - healthy(p_rest)) * imitated / (right + imitated))
 
 
 def leading(sets: Sequence[Explanation]) -> tuple[str, ...]:

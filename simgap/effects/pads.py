@@ -32,7 +32,7 @@ from simgap.effects.base import (
 # alike in all. The last cannot be told from a common gain of the force sensors where weights are unknown.
 
 # prior: Shore hardness is stated to within 5 points, about a fifth of the modulus (ISO 48-4; Gent 1958)
-SOFTNESS = Parameter(0.0, 0.2, low=-0.6, high=2.0)
+SOFTNESS = Parameter(0.0, 0.2, low=-1.0)
 FINGERS = ("give_normal1", "give_normal2", "give_shear1", "give_shear2")
 
 

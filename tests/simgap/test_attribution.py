@@ -11,12 +11,12 @@ from scipy.optimize import lsq_linear
 from simgap.attribution import search, verdict
 from simgap.attribution.attribute import _examined, _needed, _predicting, attribute, noise_of
 from simgap.attribution.heldout import RESPONSE, Heldout, scatter_between
-from simgap.attribution.posterior import Background, fitted, forms, mode, quadratic_forms, screened
+from simgap.attribution.posterior import OFF, Background, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import MODELLED, Candidate, Gap, Rows, cosines
 from simgap.attribution.verdict import ALARM, RECORD, acting, conclude, known, probabilities
 from simgap.bounded import least
 
-PLAIN = Background(np.zeros(1), np.zeros(1))  # noise exactly as stated
+PLAIN = Background(np.zeros(1), np.ones(1), np.zeros(1), np.zeros(1))  # noise exactly as stated
 SURE = 1e-12  # a p-value that leaves no doubt of a gap
 
 
@@ -59,14 +59,14 @@ def test_cosines_are_orthonormal_and_the_background_is_the_integral_over_varianc
     b = Background.usual()
     energy, count = np.array([3.0, 400.0]), np.array([5.0, 20.0])
     total, precision = b.marginal(energy, count)
-    for g in range(2):
-        each = [lp - 0.5 * count[g] * v - 0.5 * energy[g] * np.exp(-v)
-                for v, lp in zip(b.log_phi, b.log_prior, strict=True)]  # fmt: skip
-        assert total[g] == pytest.approx(float(np.log(np.sum(np.exp(each)))))
-        share = np.exp(each) / np.sum(np.exp(each))
-        assert precision[g] == pytest.approx(float(share @ np.exp(-b.log_phi)))
-    assert precision[0] > 0.5 and precision[1] == pytest.approx(20 / 400, rel=0.25)
-    assert float(np.exp(b.log_prior).sum()) == pytest.approx(1.0)
+    for s, off in enumerate(b.off):
+        for g in range(2):
+            prior = (1 - off) * b.near + off * b.far
+            each = prior * np.exp(-0.5 * count[g] * b.log_phi - 0.5 * energy[g] * np.exp(-b.log_phi))
+            assert total[s, g] == pytest.approx(float(np.log(np.sum(each))))
+            assert precision[s, g] == pytest.approx(float(each @ np.exp(-b.log_phi) / np.sum(each)))
+    assert (precision[:, 0] > 0.5).all() and precision[:, 1] == pytest.approx(20 / 400, rel=0.25)
+    assert b.near.sum() == pytest.approx(1.0) and b.far.sum() == pytest.approx(1.0)
 
 
 def enumerated(gap: Gap) -> dict[tuple[int, ...], float]:
@@ -240,13 +240,10 @@ def test_a_tolerant_prior_leaves_what_matters_as_likely_and_rounding_no_probabil
     assert acting([one("b", w) for w in each], 0.0, 1.0)["b"] == 1.0
     b = Background.usual()
     prior = b.tolerant(np.array([1.0, 1.5, 10.0, 1e4]))
-    np.testing.assert_allclose(np.logaddexp.reduce(prior, axis=0), 0.0, atol=1e-12)
-    np.testing.assert_allclose(prior[:, 0], b.log_prior)  # nothing is tolerated
-    far = b.log_phi > np.log(1e4)
-    np.testing.assert_allclose(prior[far, 3], b.log_prior[far])
-    assert (
-        prior[b.log_phi.searchsorted(np.log(5.0)), 2] > b.log_prior[b.log_phi.searchsorted(np.log(5.0))] + 2
-    )
+    np.testing.assert_allclose(prior.sum(0), 1.0, atol=1e-12)
+    np.testing.assert_allclose(prior[:, 0], b.near)  # nothing is tolerated
+    assert (prior[b.log_phi > np.log(1e4), 3] == 0.0).all()
+    assert prior[b.log_phi.searchsorted(np.log(5.0)), 2] > 0.05
 
 
 def test_what_no_effect_explains_is_unknown_and_told_where_and_of_a_sliver_too():
@@ -257,8 +254,25 @@ def test_what_no_effect_explains_is_unknown_and_told_where_and_of_a_sliver_too()
     assert found.verdict == "unknown" and found.remainder.share > 0.5
     leading = [c for c in found.where if c.share > 0.05]
     assert leading and {(c.channel, c.part) for c in leading} == {("c0", "p1")}
-    assert known(0.9) > 0.9 and known(0.01) < 0.1
-    assert known(0.4) < 0.5 < known(0.6)  # the interface's larger part
+    assert known(0.99) > 0.95 and known(0.01) < 0.15
+    assert known(0.5) < 0.5 < known(0.85)  # what a form that is off by a tenth leaves, and what it does not
+    assert known(0.85, form=0.03) < 0.5 < known(0.97, form=0.03)  # an exact form leaves less
+    assert known(0.5, p_rest=1.0) > 0.98 > known(0.5, p_rest=ALARM) > 0.5  # unless all of it may be noise
+
+
+def test_a_set_that_leaves_no_group_off_is_likelier_than_one_that_leaves_a_few():
+    f = forms(gap_of({1: 9.0}))
+    energy = f.count.copy()
+    whole, (expected, _) = Background.usual(0.1), f.marginal((), energy)
+    each = [replace(f, background=Background.usual(off)).marginal((), energy)[0] for off in OFF]
+    assert expected == pytest.approx(np.log(np.mean(np.exp(each))))
+    energy[:2] *= 30
+    few = f.marginal((), energy)[0]
+    assert (
+        expected - few
+        > replace(f, background=whole).marginal((), f.count)[0]
+        - replace(f, background=whole).marginal((), energy)[0]
+    )
 
 
 def test_gaps_that_are_tolerated_or_absorbed_are_none_told_with_their_size():
