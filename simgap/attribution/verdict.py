@@ -23,7 +23,6 @@ ALARM = 0.01  # chosen: probability that a healthy recording raises an alarm
 # (`experiments.gap_drawn`, seeds 271801 to 271911: 52 of 64 sets, 71 of 124 effects): what the catalogue
 # lacks passes for what it has, with no sign of it
 RECORD = 0.82
-MOST = 0.5  # cited: share of the gap left above which it is unknown (the interface's definition)
 # chosen: negligible share of the gap; an error of a tenth in a form leaves half of it
 LEAST = 0.02
 RULED_OUT = 20.0  # chosen: odds against a set at which it is no alternative
