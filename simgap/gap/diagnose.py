@@ -17,10 +17,10 @@ from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials
 from hmmseg.tables import Tabled
 from simgap.attribution.attribute import Attribution, EffectPosterior, attribute
-from simgap.attribution.posterior import Forms, Model, coordinates, forms
+from simgap.attribution.posterior import Forms, Model, coordinates, fitted, forms
 from simgap.attribution.problem import Candidate, Gap
-from simgap.attribution.search import sought, statistic
-from simgap.attribution.verdict import Cell, entries, log_odds, rows
+from simgap.attribution.search import detected, sought, statistic
+from simgap.attribution.verdict import ALARM, Cell, entries, log_odds, rows
 from simgap.effects import catalogue, effect_named, forms_of, free_parameters, name_of
 from simgap.effects.base import World, middle, tips
 from simgap.gap.assemble import scatters, together
@@ -37,7 +37,7 @@ from simgap.gap.problem import (
     world_without,
 )
 from simgap.gap.residuals import net_forces
-from simgap.gap.search import Identified, Search, search
+from simgap.gap.search import Identified, Search, best_fit, search
 from simgap.progress import Progress, silent
 from simgap.report.finding import sentence, tables
 
@@ -371,10 +371,13 @@ def attributed(
     if not forced:
         f = forms(gap)
         searched = f, sought(f)
-        joint = _leading(found, f, searched[1][0])
-        if joint is not None:
-            left = scatters(found.problem, joint.residual, [s.effect for s in found.scatters])
-            gap, searched = together(found.problem, gap, found.healthy, joint, left, found.redrawn), None
+        joint = [one for one in (_leading(found, f, searched[1][0]), _paired(found, *searched)) if one]
+        if joint:
+            best = min(joint, key=lambda one: one.cost)
+            left = scatters(found.problem, best.residual, [s.effect for s in found.scatters])
+            for one in joint:
+                gap = together(found.problem, gap, found.healthy, one, left, found.redrawn)
+            searched = None
     absorbed = properties_tolerated(found.problem)
     return gap, attribute(gap, healthy, forced, seed, searched=searched, absorbed=absorbed)
 
@@ -398,6 +401,21 @@ def _leading(found: Search, f: Forms, best: Model) -> Fitted | None:
     u = np.append(best.x[:common], found.healthy.u[common:])
     both = _together(found, [*alone.values()]), _together(found, at_mode, u)
     return min(both, key=lambda one: one.cost)
+
+
+def _paired(found: Search, f: Forms, models: list[Model]) -> Fitted | None:
+    """Fit the likeliest single cause with each other one, if the best set leaves more than noise.
+
+    By itself an effect is fitted, and linearised, where the other cause still acts on it; the best pair
+    counts.
+    """
+    if detected(statistic(f, models, models[0].effects)).p_value >= ALARM:
+        return None
+    every = [j for j, c in enumerate(f.gap.candidates) if _shifts_signals(c)]
+    first = _together(found, [f.gap.candidates[max(every, key=lambda j: fitted(f, (j,)).score)]])
+    name = name_of(first.effects[0])
+    keys = [key for one in found.fits for key in one.effects if name_of(key) != name]
+    return min((best_fit(found.problem, key, first) for key in keys), key=lambda one: one.cost)
 
 
 def _together(found: Search, which: Sequence[Candidate], start: np.ndarray | None = None) -> Fitted:

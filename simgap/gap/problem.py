@@ -377,6 +377,8 @@ def fit(
         curvature = given.nuisances.product(now.jacobian, now.jacobian) + np.diag(prior)
         damped = curvature + damping * np.diag(np.diag(curvature))
         step, _ = least(damped, -slope, low - u[mine], high - u[mine])
+        if -(slope + 0.5 * curvature @ step) @ step < CLOSE:
+            break
         trial = u.copy()
         trial[mine] = np.clip(u[mine] + step, low, high)
         here = cost_at(given, effects, trial, mine, blocks)

@@ -75,43 +75,45 @@ def starts(given: Problem, key: str, base: np.ndarray) -> list[np.ndarray]:
     return out
 
 
-def best_fit(given: Problem, key: str, healthy: Fitted) -> Fitted:
-    """Fit one form of an effect by itself, with the properties.
+def best_fit(given: Problem, key: str, base: Fitted) -> Fitted:
+    """Fit one form of an effect with the properties and with the effects of `base`, usually none.
 
     Starts are ranked by the cost after a linear step in their amplitudes: a frequency cannot be found while
     its oscillation has no size. Properties start at their measured values, as without the effect they may
-    have been pulled far off, and also at those of `healthy`, since displaced fingers may seem to touch
-    blocks.
+    have been pulled far off, and also at those of `base`, since displaced fingers may seem to touch blocks.
 
     Args:
         given: The problem.
         key: The form.
-        healthy: The fit without effects, to start from.
+        base: The fit without it, to start from.
     """
-    base, usual = healthy.u.copy(), healthy.jacobian[:, : given.num_common]
-    base[: given.measured.size][given.measured.ravel()] = 0.0
-    drawn = np.abs(healthy.u - base).max() > SURE  # more than the uncertainty of a touch
-    every = [start for u in (base, healthy.u)[: 1 + drawn] for start in starts(given, key, u)]
-    ranked = sorted(((*_linear_step(given, key, u, usual), u) for u in every), key=lambda r: r[0])
-    if healthy.cost - ranked[0][0] < PROMISING:
-        there = fit(given, (key,), ranked[0][2], 0, usual)
-        if there.cost < healthy.cost + PROMISING:  # else the step led too far to linearise there
+    effects, nominal, usual = (*base.effects, key), base.u.copy(), base.jacobian[:, : given.num_common]
+    nominal[: given.measured.size][given.measured.ravel()] = 0.0
+    drawn = np.abs(base.u - nominal).max() > SURE  # more than the uncertainty of a touch
+    every = [start for u in (nominal, base.u)[: 1 + drawn] for start in starts(given, key, u)]
+    ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
+    if base.cost - ranked[0][0] < PROMISING:
+        there = fit(given, effects, ranked[0][2], 0, usual)
+        if there.cost < base.cost + PROMISING:  # else the step led too far to linearise there
             return there
     leading = [u for _, u, _ in ranked[:LEADERS]]
     if len(leading) > 1:
-        leading = [min((fit(given, (key,), u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
+        leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
     # An effect on moments may change most of how easily blocks turn in the grip.
-    return fit(given, (key,), fit(given, (key,), leading[0], usual=usual).u)
+    return fit(given, effects, fit(given, effects, leading[0], usual=usual).u)
 
 
-def _linear_step(given: Problem, key: str, start: np.ndarray, usual: np.ndarray) -> tuple[float, np.ndarray]:
-    """Cost after one linear step of all but an effect's gridded parameters, and the coordinates there."""
-    fixed = [column for column, _ in _gridded(given, key)]
+def _linear_step(
+    given: Problem, effects: tuple[str, ...], start: np.ndarray, usual: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Cost after one linear step of all but the last effect's gridded parameters, and the coordinates
+    there."""
+    fixed = [column for column, _ in _gridded(given, effects[-1])]
     low, high = slots(given.num_common)[1]
-    columns = np.array([c for c in columns_of(given, (key,)) if c not in fixed])
+    columns = np.array([c for c in columns_of(given, effects) if c not in fixed])
     u = start.copy()
     u[columns] = np.clip(u[columns], low[columns], high[columns])
-    now = evaluated(given, (key,), u, columns, usual)
+    now = evaluated(given, effects, u, columns, usual)
     curvature = given.nuisances.product(now.jacobian, now.jacobian) + np.eye(columns.size)
     pull = -given.nuisances.product(now.jacobian, now.residual) - u[columns]
     step, _ = least(curvature, pull, low[columns] - u[columns], high[columns] - u[columns])

@@ -17,6 +17,7 @@ from hmmseg.hand.read import read_trial
 from hmmseg.io.rig import parse_rig
 from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms
+from simgap.attribution.search import sought
 from simgap.effects import catalogue, effect_named
 from simgap.gap import diagnose
 from simgap.gap.assemble import gap_of, scatters, together
@@ -109,6 +110,24 @@ def test_the_better_of_two_joint_fits_counts(healthy, monkeypatch):
     np.testing.assert_allclose(starts[0][own], f.gap.candidates[0].at)
     np.testing.assert_allclose(starts[1][: given.num_common], best.x[: given.num_common])
     assert np.abs(starts[1][own]).max() < 0.05  # a healthy hand's
+
+
+def test_a_second_cause_is_sought_next_to_the_likeliest_one(healthy):
+    given, _ = healthy
+    world = given.frame.world
+    push = world.force + 0.06 * world.force[..., [1, 0, 3, 2]]
+    world = world._replace(joints=world.joints + np.array([0.03, -0.02, 0.025, 0.03]), force=push)
+    given = with_nuisances(replace(given, frame=replace(given.frame, world=world)))
+    keys = ("force_crosstalk", "force_gain", "joint_offset", "table_tilt")
+
+    def paired(keys):
+        plain = fit(given, (), neutral(given))
+        fits = [best_fit(given, key, plain) for key in keys]
+        f = forms(gap_of(given, plain, fits))
+        return diagnose._paired(partly(Search, problem=given, healthy=plain, fits=tuple(fits)), f, sought(f))
+
+    assert {*paired(keys).effects} == {"force_crosstalk", "joint_offset"}
+    assert paired(keys[:1]) is None or paired(keys[:1]).effects == ()
 
 
 def test_a_fit_converges_although_derivatives_from_before_the_effect_are_off():
