@@ -71,7 +71,7 @@ def _update(
 def tracked(
     values: np.ndarray, weight: np.ndarray, sd: np.ndarray, levers: np.ndarray, walk: np.ndarray,
     new: np.ndarray, anywhere: float, pinned: np.ndarray, place: np.ndarray, drift: np.ndarray,
-    wander: np.ndarray, jump: np.ndarray, shares: np.ndarray, chance: np.ndarray,
+    wander: np.ndarray, jump: np.ndarray, shares: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:  # fmt: skip
     """Innovations of a Kalman filter on four values (T, N, 4) while joints move unseen in their dead bands.
 
@@ -80,9 +80,9 @@ def tracked(
     constant each, a random walk of variances `walk` (T, N, 3) that is replaced by a new one of variance
     `anywhere` where `new` (T, N, 3): the first weighted value determines it and gives no innovation. A joint
     is at its `place` (T, N, J) where `pinned`; elsewhere it moves by `drift` with variance `wander`, plus one
-    of `shares` (R,) of the variance `jump` (T, J) with prior probabilities `chance` (R,). The density of a
-    sample is the mean over shares; the likeliest one is kept (a multiprocess model, class II: Harrison &
-    Stevens, JRSS B 38, 1976).
+    of `shares` (R,) of the variance `jump` (T, J), as often after the last one as in the trial so far (each
+    once beforehand). The density of a sample is the mean over shares; the likeliest one is kept (a
+    multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
 
     Returns:
         Innovations (T, N, 4), their variances over the noise's, and what the mean lacks of the density of the
@@ -94,6 +94,7 @@ def tracked(
     lever = np.zeros(size)
     for t in range(values.shape[0]):
         mean, cov, fresh = np.zeros(size), np.zeros((size, size)), np.ones(size)
+        followed, last = np.ones((shares.size, shares.size)), 0
         for k in range(values.shape[1]):
             for c in range(3):
                 i = joints + c
@@ -113,7 +114,8 @@ def tracked(
                     mean[j] += drift[t, k, j]
                     cov[j, j] += wander[t, k, j]
                 loose = loose or not pinned[t, k, j]
-            choices = chance.size if loose and weight[t, k].sum() > 0 else 1
+            choices = shares.size if loose and weight[t, k].sum() > 0 else 1
+            chance, kept = followed[last] / followed[last].sum(), 0
             best, chosen_mean, chosen_cov, seen, every = -np.inf, mean, cov, 0.0, -np.inf
             for r in range(choices):
                 m, p = (mean.copy(), cov.copy()) if choices > 1 else (mean, cov)
@@ -139,9 +141,12 @@ def tracked(
                     score -= 0.5 * (np.log(factors[c]) + misses[c] ** 2 / (noise * factors[c]))
                 every = np.logaddexp(every, score)
                 if score > best:
-                    best, chosen_mean, chosen_cov, seen = score, m, p, score - prior
+                    best, chosen_mean, chosen_cov, seen, kept = score, m, p, score - prior, r
                     out[t, k], factor[t, k] = misses, factors
             cost += seen - every
+            if choices > 1:
+                followed[last, kept] += 1
+                last = kept
             mean, cov = chosen_mean, chosen_cov
             for c in range(4):
                 if constant[c] >= 0:

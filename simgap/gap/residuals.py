@@ -234,8 +234,8 @@ def firmness(grip: np.ndarray, held: np.ndarray, moves: np.ndarray, loose: float
 
 
 # prior: variances of unseen motion of joints between two samples, as shares of that of anywhere in the dead
-# band, and their probabilities: usually there is none
-SHARES, CHANCES = np.array([0.0, 0.01, 1.0]), np.array([0.8, 0.1, 0.1])
+# band
+SHARES = np.array([0.0, 0.01, 1.0])
 
 
 def in_grip(
@@ -272,7 +272,7 @@ def in_grip(
         values = values - (levers @ band.place[..., None])[..., 0]
     return tracked(
         values, weight, noise, -levers, walk, arrays.new, ANYWHERE**2, band.pinned, band.place, band.drift,
-        band.wander, band.jump, SHARES, CHANCES,
+        band.wander, band.jump, SHARES,
     )  # fmt: skip
 
 

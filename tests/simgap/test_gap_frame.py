@@ -285,7 +285,7 @@ def test_noise_smooth_motion_and_pushes_have_no_kinks_and_touches_no_speeds():
 DT = 0.05  # s
 
 
-def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares=(0.0,), chance=(1.0,)):
+def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares=(0.0,)):
     """What the filter makes of one trial's values (N, 4). `joints`: levers, pinned, place and jump of two."""
     n = len(values)
     levers, pinned, place, jump = joints or (np.zeros((n, 4, 0)), np.zeros((n, 0)) > 0, np.zeros((n, 0)), 0.0)
@@ -293,8 +293,7 @@ def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares
     return tracked(values[None], np.broadcast_to(weight, (1, n, 4)) * 1.0, np.full((1, n, 4), sd),
                    levers[None], np.broadcast_to(np.reshape(walk, (-1, 1)), (1, n, 3)) * 1.0,
                    np.broadcast_to(new, (1, n, 3)) > 0, ANYWHERE**2, pinned[None], place[None], still,
-                   still + 1e-6, np.full((1, place.shape[1]), jump), np.asarray(shares),
-                   np.asarray(chance))  # fmt: skip
+                   still + 1e-6, np.full((1, place.shape[1]), jump), np.asarray(shares))  # fmt: skip
 
 
 def _cost(found, sd, channel) -> float:
@@ -333,7 +332,7 @@ def test_new_grips_unknown_samples_and_choices_that_show_nowhere_tell_nothing():
     n = 30
     joints = np.zeros((n, 4, 2)), np.zeros((n, 2), bool), np.zeros((n, 2)), 4 / 3
     values = np.random.default_rng(0).standard_normal((n, 4))
-    cost = _tracked(values, 1.0, joints=joints, shares=(0.0, 1.0), chance=(0.9, 0.1))[2]
+    cost = _tracked(values, 1.0, joints=joints, shares=(0.0, 1.0))[2]
     assert cost == pytest.approx(0.0, abs=1e-9)
 
 
@@ -400,8 +399,13 @@ def test_a_joint_that_jumps_unseen_costs_one_choice_and_is_followed():
     values = (levers * place[:, None]).sum(-1) + sd * rng.standard_normal((n, 4))
     start = np.full((n, 2), -1.0)
     joints = levers, np.zeros((n, 2), bool), start, 4 / 3
-    out, factor, cost = _tracked(values, sd, joints=joints, shares=(0.0, 1.0), chance=(0.9, 0.1))
-    assert cost == pytest.approx(-(n - 1) * np.log(0.9) - np.log(0.1), abs=2.5)  # at the start it may as well
+    out, factor, cost = _tracked(values, sd, joints=joints, shares=(0.0, 1.0))
+    followed, last, chain = np.ones((2, 2)), 0, 0.0
+    for moved in (np.arange(n) == 12).astype(int):  # as often after the last one as so far
+        chain -= np.log(followed[last, moved] / followed[last].sum())
+        followed[last, moved] += 1
+        last = moved
+    assert cost == pytest.approx(chain, abs=2.5)  # at the start it may as well
     jumped = np.flatnonzero(factor[0, :, 2] > 1e3)
     assert 12 in jumped and jumped.size <= 2
     others = np.setdiff1d(np.arange(2, n), jumped)
