@@ -49,8 +49,7 @@ def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
 
 
 def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
-    """A line if the tool's inertia is no gripper's, or differs from the stated one by the factor of a
-    unit."""
+    """A line if the tool's inertia is no gripper's, or differs from the stated one by a unit's factor."""
     gripper = rig.wrist
     names, inertia, stated = gripper.wrench[:3], abs(tool.inertia), gripper.tool_mass
     where = f"{trial.file}: columns {', '.join(names)}"

@@ -238,8 +238,7 @@ def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMot
 
 
 def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
-    """The tool from samples `free` (num_timesteps,) of free motion; InputError if they do not determine
-    it."""
+    """The tool from samples `free` (num_timesteps,) of free motion; InputError where they leave it open."""
     return tool_of(trial.file, rig, free_motion(trial, rig, pose, free), float(trial.t.mean()))
 
 
@@ -324,8 +323,7 @@ def _spread(vectors: np.ndarray) -> float:
 
 
 def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.ndarray) -> np.ndarray:
-    """Q (3, 3) as the rig states it, otherwise from the correlation of the reading with the specific
-    force."""
+    """Q (3, 3) as the rig states it, else from the correlation of the reading with the specific force."""
     total = weights.sum()
     f, v = force - weights @ force / total, felt - weights @ felt / total
     together = (weights[:, None] * f).T @ v

@@ -213,10 +213,7 @@ def _raised(grip: Grip, pose: Pose) -> np.ndarray:
 
 
 def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
-    """Load carried while raised, or pushed along while moving [N]; 0 if insignificant.
-
-    None if the hand does not move, which leaves nothing to judge by.
-    """
+    """Load [N] carried while raised, or pushed along; 0 if insignificant, None if the hand does not move."""
     raised, moved = _raised(grip, pose), has_moved(grip.start, grip.stop, pose)
     lifted, force = bool(raised.any()), force[grip.start : grip.stop]
     load = median_load(force[raised] @ pose.up if lifted else force[moved] @ pose.across, pose, tool)

@@ -79,8 +79,7 @@ def find_ring(lay: Layout) -> Ring | None:
 
 
 def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Windows (trials, n) of equal length, each from its largest swing on: the largest deviation from its
-    median in its first third."""
+    """Windows (trials, n) of equal length, each from its largest deviation from its median on, early."""
     cut = []
     for values in windows:
         early = values[: max(int(values.size * SWING), 1)]
@@ -130,8 +129,7 @@ def _range(windows: np.ndarray, rate: float) -> tuple[float, float]:
 
 
 def _screened(windows: np.ndarray, rate: float) -> tuple[float, float, float]:
-    """Best frequency [Hz] and damping on a grid, and the share of the variance about each window's parabola
-    that they leave: 1 where windows are too short."""
+    """Best frequency [Hz] and damping on a grid, and the share of variance left; 1 of too short windows."""
     low, high = _range(windows, rate)
     if windows.shape[1] < SHORTEST or low >= high:
         return np.nan, np.nan, 1.0

@@ -272,8 +272,7 @@ def _sub_bands(low: int, window: int) -> tuple[slice, ...]:
 
 
 def resampled(t: np.ndarray, values: np.ndarray, times: np.ndarray, rate: float) -> np.ndarray:
-    """Resample a signal with gaps at `times` (n,) [s]: averaged over 1 / rate if it was sampled much faster,
-    else interpolated."""
+    """Resample a signal with gaps at `times` (n,) [s]: averaged if sampled much faster, else interpolated."""
     known = np.isfinite(values)
     if 1 / np.median(np.diff(t)) < 1.5 * rate:
         return np.interp(times, t[known], values[known])

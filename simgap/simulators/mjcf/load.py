@@ -316,8 +316,7 @@ TIMES = 100.0  # limit: how many times as far as its log a slide may move in a m
 
 
 def _check_travel(simulator: MjcfSimulator, log: Recording, file: str) -> None:
-    """InputError where a slide without a range moves so much less or more in the log than in the model under
-    its commands that the unit must be another; units are never guessed."""
+    """InputError where a slide without a range moves so unlike the model that the unit must be another."""
     model = simulator.model
     slides = {c: j for c, j in simulator.joints.items() if int(model.jnt_type[j]) == SLIDE}
     slides = {c: j for c, j in slides.items() if not model.jnt_limited[j]}

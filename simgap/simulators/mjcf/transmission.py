@@ -144,8 +144,7 @@ class Motion:
 
 
 def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
-    """The motion along a log; what no column shows moves as the model's own run has it, ties and loops
-    closed."""
+    """The motion along a log; what no column shows moves as in the model's own run, loops closed."""
     model, states = simulator.model, simulator.along(log)
     nq, seen = model.nq, {joint: log[column] for column, joint in simulator.joints.items()}
     for joint in np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist():
