@@ -172,7 +172,7 @@ def variances(lay: Layout, deviations: np.ndarray, index: np.ndarray) -> np.ndar
 
 
 def _common(given: Scene, channel: int) -> np.ndarray:
-    """Orthonormal ways (n, q) in which trials differ: offset, slope, size, time, loudness, a subtask's offset."""
+    """Orthonormal ways (n, q) in which trials differ: offset, slope, size, time, loudness, by subtask."""
     lay, t, x = given.layout, given.t, given.course[channel]
     slow = (lay.kind[lay.of_channel(channel)] == SLOW).astype(float)
     moved = [t, x, delayed(t, x, LATE) - x]  # a drift, a gain, a lag

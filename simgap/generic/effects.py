@@ -202,7 +202,7 @@ def _log_powers(given: Scene, channel: int, acting: Acting, rung: np.ndarray) ->
 
 
 def _as_read(given: Scene, cut: Cut, channel: int, acting: Acting, rung: np.ndarray) -> np.ndarray:
-    """A simulated trial's channel (n,) as recorded; mirrored before its start, as a held value has no noise."""
+    """A simulated trial's channel (n,) as recorded; before its start mirrored, as held values lack noise."""
     t, values = cut.trial.t, cut.trial.channels[given.layout.ensembles.channels[channel]]
     there = np.isfinite(values)
     values = values if there.all() else np.interp(t, t[there], values[there])
