@@ -24,8 +24,6 @@ LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: range of damping ratios that count as
 FREQUENCIES = 80  # numerics: points of the search's grid
 SWING = 1 / 3  # chosen: first share of a window, searched for the largest swing
 SHORTEST = 12  # numerics: samples; an oscillation is searched for in no shorter window
-PERIODS = 1.5  # chosen: periods of the slowest oscillation that a window must hold
-HIGHEST = 0.4  # chosen: highest frequency searched, over the sampling rate
 SIMPLEX: dict[str, Any] = {  # numerics: of the search
     "method": "Nelder-Mead", "options": {"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},
 }  # fmt: skip
@@ -124,8 +122,8 @@ def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
 
 
 def _range(windows: np.ndarray, rate: float) -> tuple[float, float]:
-    """Lowest and highest frequency [Hz] that windows (trials, n) resolve."""
-    return PERIODS * rate / max(windows.shape[1], 1), HIGHEST * rate
+    """Frequencies [Hz] of one period in windows (trials, n), and of two samples a period (Nyquist's)."""
+    return rate / max(windows.shape[1], 1), rate / 2
 
 
 def _screened(windows: np.ndarray, rate: float) -> tuple[float, float, float]:
