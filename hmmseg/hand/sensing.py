@@ -79,9 +79,8 @@ def _nearest_unit(size: float) -> tuple[str, float]:
 def _quiet_differences(channels: list[np.ndarray]) -> list[np.ndarray]:
     """Second differences in the quietest quarter of stretches, which has no contacts."""
     every = [v[np.isfinite(v)] for v in channels]
-    pieces = [
-        np.diff(p, 2) for v in every for p in np.array_split(v, max(1, v.size // STRETCH)) if p.size > 2
-    ]
+    parts = (p for v in every for p in np.array_split(v, max(1, v.size // STRETCH)))
+    pieces = [np.diff(p, 2) for p in parts if p.size > 2]
     pieces.sort(key=lambda piece: float(piece @ piece) / piece.size)
     return pieces[: max(1, len(pieces) // 4)]
 

@@ -86,10 +86,8 @@ def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
     if load is not None:
         problem = f"say that what is lifted pulls up with {abs(load):.3g} N"
     where = f"{trial.file}: columns {', '.join(rig.wrist.wrench[:3])}"
-    right = "false" if rig.wrist.reaction else "true"
-    return InputError(
-        where, f"{problem}: the sign is the other way round", f"reaction = {right} under [gripper]"
-    )
+    remedy = f"reaction = {'false' if rig.wrist.reaction else 'true'} under [gripper]"
+    return InputError(where, f"{problem}: the sign is the other way round", remedy)
 
 
 def pose_remark(trial: Trial, rig: Rig, load: float) -> str:
@@ -299,10 +297,9 @@ def _with_still_axes(trial: Trial, rig: Rig) -> Trial:
         if np.isfinite(values).any():
             continue
         if name not in may:
-            problem = next(
-                (f.problem.partition(",")[0] for f in trial.faults if f.channel == name), "is empty"
-            )
-            raise InputError(f"{trial.file}: column {name}", problem, "readings of a working sensor")
+            said = (f.problem.partition(",")[0] for f in trial.faults if f.channel == name)
+            where = f"{trial.file}: column {name}"
+            raise InputError(where, next(said, "is empty"), "readings of a working sensor")
         channels[name] = np.zeros(trial.t.size)
     return replace(trial, channels=channels)
 

@@ -248,9 +248,8 @@ def composed(errors: np.ndarray, rng: np.random.Generator, paces=None) -> Compos
 def misses(seed: int, shared: bool, repeats: bool) -> float:
     """By how many of its own sd the size is missed."""
     rng = np.random.default_rng(seed)
-    factor = SIZE * np.linalg.cholesky(
-        np.exp(-np.abs(TIMES[:, None] - TIMES) / TAU) + 1e-9 * np.eye(TIMES.size)
-    )
+    alike = np.exp(-np.abs(TIMES[:, None] - TIMES) / TAU) + 1e-9 * np.eye(TIMES.size)
+    factor = SIZE * np.linalg.cholesky(alike)
     own = factor @ rng.standard_normal((TIMES.size, 1 if shared else LOGS))
     made = composed(np.broadcast_to(own.T, (LOGS, TIMES.size)), rng)
     made = made if repeats else replace(made, motion=())
@@ -506,9 +505,8 @@ def swung(gravity=True, angle=0.0, rate=0.0, torque=0.0, seconds=0.2, **laws):
 
 def test_friction_by_load_holds_at_rest_up_to_its_limit():
     weight = MASS * 9.81 * REACH * np.sin(0.5)
-    held, _, _ = swung(
-        angle=0.5, load_friction=2.1
-    )  # half of that of the weight: 1.05 times as much as holds
+    # half of that of the weight: 1.05 times as much as holds
+    held, _, _ = swung(angle=0.5, load_friction=2.1)
     assert np.abs(held - 0.5).max() < 3e-3  # MuJoCo's friction creeps, by 12 mrad/s here
     _, rate, t = swung(angle=0.5, load_friction=1.5, seconds=0.02)
     assert rate[-1] / t[-1] == pytest.approx(-(weight - 0.75 * weight) / INERTIA, rel=0.03)
