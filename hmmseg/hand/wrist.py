@@ -27,7 +27,7 @@ from hmmseg.hand.sensing import tool_warnings
 from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warnings, pose_of, smooth
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
-from hmmseg.levels import MOVED, SURE
+from hmmseg.levels import MOVED, SHOWN, SURE
 from hmmseg.robust import bridged, extent, robust_sd, runs
 
 WIDEST = 1.0  # limit: m; no parallel gripper opens further
@@ -254,7 +254,6 @@ def bears(start: int, stop: int, pose: Pose, force: np.ndarray, tool: Tool) -> f
 LAG = 0.012
 TILT = 0.01  # prior: rad; tilt of a hand whose orientation is not recorded
 SURELY = 0.1  # chosen: s from any grip beyond which nothing is held; a touch is known to a fifth of it
-CLIPPED = 2.0  # chosen: noise scales to which forces in free motion are clipped
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
 NOMINAL = 1.0  # numerics: N; force assumed for a grip of rigid pads if none was measured; any will do
 HIDDEN_GRIP = (
@@ -354,7 +353,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
         free[max(each.start - 1, 0) : each.stop + 1] = False
     strays = _strays(trial, free, np.hypot(fx, fy), tool)
     for felt in (fx, fy):  # nothing is held there, whatever the wrist feels
-        felt[free] = np.clip(felt[free], -CLIPPED * tool.noise, CLIPPED * tool.noise)
+        felt[free] = np.clip(felt[free], -SHOWN * tool.noise, SHOWN * tool.noise)
     grip = np.zeros(t.size)
     shown = opening.copy()
     rigid = not np.isfinite(rig.fingertip.normal_stiffness)
