@@ -244,8 +244,9 @@ def test_a_tolerant_prior_leaves_what_matters_as_likely_and_rounding_no_probabil
     np.testing.assert_allclose(prior[:, 0], b.log_prior)  # nothing is tolerated
     far = b.log_phi > np.log(1e4)
     np.testing.assert_allclose(prior[far, 3], b.log_prior[far])
-    five = b.log_phi.searchsorted(np.log(5.0))
-    assert prior[five, 2] > b.log_prior[five] + 2
+    assert (
+        prior[b.log_phi.searchsorted(np.log(5.0)), 2] > b.log_prior[b.log_phi.searchsorted(np.log(5.0))] + 2
+    )
 
 
 def test_what_no_effect_explains_is_unknown_and_told_where_and_of_a_sliver_too():
