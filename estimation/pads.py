@@ -19,10 +19,11 @@ from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
 from hmmseg.levels import TAIL
 from hmmseg.robust import median_of_known, robust_sd, weighted_median, white_sd
+from hmmseg.segmentation.pads import SOFT
 from hmmseg.tables import Brief
 
-RIGID = 4000.0  # chosen: N/m; reference stiffness whose give shares refer to if the rig's pads are `inf`
-UNSTATED = 0.8  # prior: sd of the give of unstated pads, as a share: 2e-4 m/N, as in hmmseg.segmentation.pads
+UNSTATED = 0.8  # prior: sd of the give of unstated pads, as a share of that of RIGID ones
+RIGID = UNSTATED / SOFT  # prior: N/m; the stiffness that shares refer to if the rig's pads are `inf`
 STATED_SD = 0.3  # prior: relative error of a wrong stiffness: foams of one make differ by as much
 MISSTATED = 0.1  # prior: share of rigs whose pads are off by more than they admit
 CLOSED = 0.15  # chosen: share of the grip's own force below which one finger may not touch yet

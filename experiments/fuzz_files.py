@@ -181,14 +181,11 @@ def _binary(folder: Path, table: dict[str, np.ndarray]) -> dict[str, bytes]:
         pyarrow.parquet.write_table(pyarrow.table(table), buffer)
         made["trial.parquet"] = buffer.getvalue()
     with contextlib.suppress(ImportError):  # of the tests; on the path where these run
-        from file_writers import write_bag, write_lerobot, write_mcap, write_robomimic
+        from file_writers import bag_of, mcap_of, planted, write_lerobot, write_robomimic
 
-        for name, write in (
-            ("log.mcap", write_mcap),
-            ("log.bag", write_bag),
-            ("demos.hdf5", write_robomimic),
-        ):
-            made[name] = write(folder / f"made-{name}").read_bytes()
+        made["demos.hdf5"] = write_robomimic(folder / "made-demos.hdf5").read_bytes()
+        for name, write in (("log.mcap", mcap_of), ("log.bag", bag_of)):
+            made[name] = write(folder / f"made-{name}", planted()).read_bytes()
         made["info.json"] = (write_lerobot(folder / "lerobot") / "meta/info.json").read_bytes()
     return made
 

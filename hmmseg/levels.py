@@ -7,6 +7,7 @@ from math import log
 # chosen: noise sds at which something is surely there, or contradicts a statement: normal noise exceeds them
 # once in two million readings, an hour at 500 Hz
 SURE = 5.0
+SHOWN = 3.0  # chosen: noise sds above which something shows: normal noise exceeds them once in 370 readings
 CERTAIN = 0.99  # chosen: probability from which something is taken as true, and reported
 FIRM = 0.5  # chosen: share of a grip's usual force from which the fingers hold
 MOVED = 3e-3  # chosen: m from which a hand or a block has moved; blocks are taller, slips shorter

@@ -77,9 +77,8 @@ class Rows:
             self.notes.append(f"{WHERE}: row {self._number}, the last, is cut off and left out")
             return None
         if len(cells) != self._num:
-            raise InputError(
-                f"{WHERE}: row {self._number}", f"has {len(cells)} cells", f"{self._num} as in the header"
-            )
+            where = f"{WHERE}: row {self._number}"
+            raise InputError(where, f"has {len(cells)} cells", f"{self._num} as in the header")
         try:
             values = [math.nan if i < 0 else float(cells[i]) for i in self._picked]
         except ValueError:

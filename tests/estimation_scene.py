@@ -33,9 +33,8 @@ def make_design(num_trials=4, seed=0, deviations=0, objects=OBJECTS, count=40.0)
     rows = [(t, m, c) for t in range(num_trials) for m in range(len(objects)) for c in range(3)]
     trial, move, channel = np.array(rows).T
     coefficients = np.zeros((len(rows), len(unknowns)))
-    coefficients[np.arange(len(rows)), 3 * move + channel] = np.where(
-        channel == 0, 1 + 0.02 * rng.normal(size=len(rows)), 1.0
-    )
+    factor = np.where(channel == 0, 1 + 0.02 * rng.normal(size=len(rows)), 1.0)
+    coefficients[np.arange(len(rows)), 3 * move + channel] = factor
     unit = UNIT[channel] * (1 + 0.1 * rng.normal(size=len(rows)))
     shifts, free_shifts = np.zeros((len(rows), deviations)), np.zeros((num_trials, 4, deviations))
     if deviations > 0:

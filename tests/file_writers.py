@@ -172,12 +172,8 @@ def lerobot_of(folder: Path, version: int, fps: int, names: list[str], states: l
             "timestamp": (np.arange(n) / fps).astype(np.float32), "frame_index": np.arange(n),
             "episode_index": np.full(n, k)}))  # fmt: skip
     if version == 2:
-        (folder / "meta/episodes.jsonl").write_text(
-            "".join(
-                json.dumps({"episode_index": k, "tasks": ["stack"], "length": n}) + "\n"
-                for k, n in enumerate(lengths)
-            )
-        )
+        said = [{"episode_index": k, "tasks": ["stack"], "length": n} for k, n in enumerate(lengths)]
+        (folder / "meta/episodes.jsonl").write_text("".join(json.dumps(each) + "\n" for each in said))
         for k, table in enumerate(tables):
             pq.write_table(table, folder / f"data/chunk-000/episode_{k:06d}.parquet")
     else:

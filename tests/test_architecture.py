@@ -288,12 +288,8 @@ def test_a_notebook_shows_every_result_once_and_every_plot():
 
 def test_results_read_like_the_terminals_table_and_fill_no_screen(identified, monkeypatch):
     text, aligned = repr(identified), identified.aligned
-    parts = [
-        *vars(identified).values(),
-        *vars(aligned).values(),
-        *vars(aligned.trials[0]).values(),
-        identified,
-    ]
+    whole = (identified, aligned, aligned.trials[0])
+    parts = [identified, *(value for each in whole for value in vars(each).values())]
     assert max(len(repr(value)) for value in parts if dataclasses.is_dataclass(value)) < 2500  # characters
     assert "block1" in text and "weight" in text and "95 % interval" in text
     assert "<table>" in identified._repr_html_() and "<td>block1</td>" in identified._repr_html_()

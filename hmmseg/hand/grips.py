@@ -136,8 +136,7 @@ def _fastest(t: np.ndarray, opening: np.ndarray, begun: int, first: int, held: f
 
 
 def _release(t: np.ndarray, opening: np.ndarray, last: int, held: float) -> tuple[float, float] | None:
-    """Opening [m] at which the fingers leave their stand after sample `last`, and its sd; None within
-    noise."""
+    """Opening [m] at which the fingers leave their stand after sample `last`, and its sd; None in noise."""
     lead = max(3, int(3 * STEP / np.median(np.diff(t))))
     way, noise = _coarse(t, opening, max(last - lead, 0), opening.size), _noise(opening)
     wide = np.flatnonzero(way > (held + opening[-1]) / 2)
@@ -169,8 +168,7 @@ def _noise(opening: np.ndarray) -> float:
 
 
 def _with_prior(seen: tuple[float, float], held: float) -> tuple[float, float]:
-    """Mean and sd [m] of the opening at the touch: what was `seen` of it, combined with the prior on the
-    yield."""
+    """Mean and sd [m] of the opening at the touch: what was `seen` of it and the prior on the yield."""
     precision = np.array([seen[1], GIVE[1]]) ** -2.0
     mean = max(float(precision @ [seen[0], held + GIVE[0]] / precision.sum()), held)
     return mean, max(float(precision.sum() ** -0.5), SOFT * (mean - held))

@@ -74,8 +74,7 @@ def exchanged(
 
 
 def changed(channels: Iterable[str], rig: Rig | None, **change: Any) -> dict[str, dict[str, Any]]:
-    """Entries of channels with a change of `unit`, `sign` or `offset` [SI] on top of what the rig says of
-    them."""
+    """Entries of channels with a change of `unit`, `sign` or `offset` [SI] of what the rig says."""
     out = {}
     for channel in channels:
         now = Column() if rig is None else (rig.columns | rig.topics).get(channel, Column())
@@ -328,10 +327,7 @@ def check_signs(trial: Trial, rig: Rig) -> list[Finding]:
 
 
 def _sides(apart: int, towards: int, carried: int, both_bear: bool, trial: Trial, rig: Rig) -> list[Finding]:
-    """Judge the signs of x2 - x1 and fx1 - fx2 in holds and of the load in lifts (0: unclear).
-
-    `both_bear`: whether fy1 and fy2 have the same sign in lifts.
-    """
+    """Judge the signs of x2 - x1 and fx1 - fx2 in holds, of the load and of fy1 fy2 in lifts (0: unclear)."""
     if apart < 0 and towards < 0:
         problem = "finger 1 holds from the right, finger 2 from the left: the fingers are swapped"
         stems = JOINT_STEMS if rig.jointed else CARTESIAN_STEMS
@@ -405,15 +401,13 @@ def find_holds(squeeze: np.ndarray, y: np.ndarray) -> Holds | None:
 
 
 def _zero(load: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """The load [N] that the sensors read of nothing (num_timesteps,), between free stretches on a line: zeros
-    drift, and a light block's weight is soon exceeded."""
+    """Load [N] read of nothing (num_timesteps,), on lines between free stretches, as zeros drift."""
     each = [((i + j) / 2, np.median(load[i:j])) for i, j in runs(free) if j - i >= BRIEF]
     return np.interp(np.arange(load.size), *np.transpose(each)) if each else np.zeros(load.size)
 
 
 def _pushing_alike(common: np.ndarray, squeeze: np.ndarray, load: np.ndarray) -> int | None:
-    """Sign of both fx where they push the same way as strongly and as long as a grip would; None
-    elsewhere."""
+    """Sign of both fx where they push the same way as strongly and as long as a grip would, or None."""
     scale = float(np.quantile(np.abs(common), 0.95))
     noise = white_sd(common, 1)
     strong = np.abs(common) > scale / 2

@@ -49,8 +49,7 @@ def check_noise(trial: Trial, rig: Rig) -> list[Finding]:
 
 
 def tool_warnings(trial: Trial, rig: Rig, tool: Tool) -> tuple[str, ...]:
-    """A line if the tool's inertia is no gripper's, or differs from the stated one by the factor of a
-    unit."""
+    """A line if the tool's inertia is no gripper's, or differs from the stated one by a unit's factor."""
     gripper = rig.wrist
     names, inertia, stated = gripper.wrench[:3], abs(tool.inertia), gripper.tool_mass
     where = f"{trial.file}: columns {', '.join(names)}"
@@ -80,9 +79,8 @@ def _nearest_unit(size: float) -> tuple[str, float]:
 def _quiet_differences(channels: list[np.ndarray]) -> list[np.ndarray]:
     """Second differences in the quietest quarter of stretches, which has no contacts."""
     every = [v[np.isfinite(v)] for v in channels]
-    pieces = [
-        np.diff(p, 2) for v in every for p in np.array_split(v, max(1, v.size // STRETCH)) if p.size > 2
-    ]
+    parts = (p for v in every for p in np.array_split(v, max(1, v.size // STRETCH)))
+    pieces = [np.diff(p, 2) for p in parts if p.size > 2]
     pieces.sort(key=lambda piece: float(piece @ piece) / piece.size)
     return pieces[: max(1, len(pieces) // 4)]
 

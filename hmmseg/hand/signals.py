@@ -283,9 +283,7 @@ def remove_roll(trial: Trial) -> Trial:
     beyond = np.flatnonzero(np.abs(np.nan_to_num(roll)) > STEEPEST)
     if beyond.size:
         where = f"{trial.file}: sample {beyond[0] + 1}, column {ROLL}"
-        expected = (
-            f"radians, 0 where the fingers are level, at most {STEEPEST:g} either way (is it in degrees?)"
-        )
+        expected = f"radians, 0 where fingers are level, at most {STEEPEST:g} either way (is it in degrees?)"
         raise InputError(where, f"{roll[beyond[0]]:.3g} rad", expected)
     roll = bridged(roll, trial.t)
     c = dict(trial.channels)

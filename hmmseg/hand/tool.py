@@ -24,7 +24,7 @@ import numpy as np
 from hmmseg.errors import InputError
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import Trial
-from hmmseg.levels import SURE, TAIL
+from hmmseg.levels import SURE, TAIL, decisive
 from hmmseg.robust import bridged, robust_sd, white_sd
 
 WINDOW, WIDEST = 0.1, 0.4  # chosen: s over which motion is smoothed: arms change no faster
@@ -238,8 +238,7 @@ def free_motion(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> FreeMot
 
 
 def free_tool(trial: Trial, rig: Rig, pose: Pose, free: np.ndarray) -> Tool:
-    """The tool from samples `free` (num_timesteps,) of free motion; InputError if they do not determine
-    it."""
+    """The tool from samples `free` (num_timesteps,) of free motion; InputError where they leave it open."""
     return tool_of(trial.file, rig, free_motion(trial, rig, pose, free), float(trial.t.mean()))
 
 
@@ -324,8 +323,7 @@ def _spread(vectors: np.ndarray) -> float:
 
 
 def _axes(gripper: Gripper, weights: np.ndarray, force: np.ndarray, felt: np.ndarray) -> np.ndarray:
-    """Q (3, 3) as the rig states it, otherwise from the correlation of the reading with the specific
-    force."""
+    """Q (3, 3) as the rig states it, else from the correlation of the reading with the specific force."""
     total = weights.sum()
     f, v = force - weights @ force / total, felt - weights @ felt / total
     together = (weights[:, None] * f).T @ v
@@ -354,7 +352,7 @@ def applied_force(trial: Trial, rig: Rig, pose: Pose, tool: Tool) -> np.ndarray:
     return force if gripper.frame == "world" else np.einsum("tij,tj->ti", pose.turned, force)
 
 
-BETTER = 0.8  # chosen: ratio of noises; over a hundred independent samples so much is beyond chance
+OTHER_ORDER = 0.1  # prior: share of rigs that list a quaternion in another order than x, y, z, w
 
 
 def order_warnings(trial: Trial, rig: Rig, tool: Tool, free: np.ndarray) -> tuple[str, ...]:
@@ -367,11 +365,13 @@ def order_warnings(trial: Trial, rig: Rig, tool: Tool, free: np.ndarray) -> tupl
         return ()
     rolled = (*gripper.quaternion[1:], gripper.quaternion[0])
     other = gripper.model_copy(update={"quaternion": rolled})
+    pose = pose_of(trial, other)
     try:
-        found = free_tool(trial, rig.model_copy(update={"gripper": other}), pose_of(trial, other), free)
+        found = free_tool(trial, rig.model_copy(update={"gripper": other}), pose, free)
     except InputError:
         return ()
-    if found.noise > BETTER * tool.noise:
+    independent = 3 * free.sum() * float(np.median(np.diff(trial.t))) / pose.window
+    if independent * np.log(tool.noise / found.noise) < decisive(OTHER_ORDER):
         return ()
     where = f"{trial.file}: columns {', '.join(gripper.quaternion)}"
     problem = f"explain the hand's own share {tool.noise / found.noise:.2g} times better as w, x, y, z"

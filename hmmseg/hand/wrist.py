@@ -27,7 +27,7 @@ from hmmseg.hand.sensing import tool_warnings
 from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warnings, pose_of, smooth
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
-from hmmseg.levels import MOVED, SURE
+from hmmseg.levels import MOVED, SHOWN, SURE
 from hmmseg.robust import bridged, extent, robust_sd, runs
 
 WIDEST = 1.0  # limit: m; no parallel gripper opens further
@@ -86,10 +86,8 @@ def other_sign(trial: Trial, rig: Rig, load: float | None = None) -> InputError:
     if load is not None:
         problem = f"say that what is lifted pulls up with {abs(load):.3g} N"
     where = f"{trial.file}: columns {', '.join(rig.wrist.wrench[:3])}"
-    right = "false" if rig.wrist.reaction else "true"
-    return InputError(
-        where, f"{problem}: the sign is the other way round", f"reaction = {right} under [gripper]"
-    )
+    remedy = f"reaction = {'false' if rig.wrist.reaction else 'true'} under [gripper]"
+    return InputError(where, f"{problem}: the sign is the other way round", remedy)
 
 
 def pose_remark(trial: Trial, rig: Rig, load: float) -> str:
@@ -213,10 +211,7 @@ def _raised(grip: Grip, pose: Pose) -> np.ndarray:
 
 
 def _load(grip: Grip, pose: Pose, force: np.ndarray, tool: Tool) -> float | None:
-    """Load carried while raised, or pushed along while moving [N]; 0 if insignificant.
-
-    None if the hand does not move, which leaves nothing to judge by.
-    """
+    """Load [N] carried while raised, or pushed along; 0 if insignificant, None if the hand does not move."""
     raised, moved = _raised(grip, pose), has_moved(grip.start, grip.stop, pose)
     lifted, force = bool(raised.any()), force[grip.start : grip.stop]
     load = median_load(force[raised] @ pose.up if lifted else force[moved] @ pose.across, pose, tool)
@@ -259,7 +254,6 @@ def bears(start: int, stop: int, pose: Pose, force: np.ndarray, tool: Tool) -> f
 LAG = 0.012
 TILT = 0.01  # prior: rad; tilt of a hand whose orientation is not recorded
 SURELY = 0.1  # chosen: s from any grip beyond which nothing is held; a touch is known to a fifth of it
-CLIPPED = 2.0  # chosen: noise scales to which forces in free motion are clipped
 STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
 NOMINAL = 1.0  # numerics: N; force assumed for a grip of rigid pads if none was measured; any will do
 HIDDEN_GRIP = (
@@ -302,10 +296,9 @@ def _with_still_axes(trial: Trial, rig: Rig) -> Trial:
         if np.isfinite(values).any():
             continue
         if name not in may:
-            problem = next(
-                (f.problem.partition(",")[0] for f in trial.faults if f.channel == name), "is empty"
-            )
-            raise InputError(f"{trial.file}: column {name}", problem, "readings of a working sensor")
+            said = (f.problem.partition(",")[0] for f in trial.faults if f.channel == name)
+            where = f"{trial.file}: column {name}"
+            raise InputError(where, next(said, "is empty"), "readings of a working sensor")
         channels[name] = np.zeros(trial.t.size)
     return replace(trial, channels=channels)
 
@@ -360,7 +353,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
         free[max(each.start - 1, 0) : each.stop + 1] = False
     strays = _strays(trial, free, np.hypot(fx, fy), tool)
     for felt in (fx, fy):  # nothing is held there, whatever the wrist feels
-        felt[free] = np.clip(felt[free], -CLIPPED * tool.noise, CLIPPED * tool.noise)
+        felt[free] = np.clip(felt[free], -SHOWN * tool.noise, SHOWN * tool.noise)
     grip = np.zeros(t.size)
     shown = opening.copy()
     rigid = not np.isfinite(rig.fingertip.normal_stiffness)

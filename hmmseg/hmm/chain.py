@@ -83,9 +83,8 @@ class Chain(Leaves):
             skips = (log_skip,) if whole else tuple(log_skip)  # type: ignore[arg-type]
         bands = tuple(_weights(band) for band in (log_stay, log_advance, *skips))
         if bands[0].ndim not in (1, 2) or not bands[0].shape[-1]:
-            raise ValueError(
-                f"log_stay: shape {bands[0].shape}, expected (num_states,) or one such row a step"
-            )
+            shape = bands[0].shape
+            raise ValueError(f"log_stay: shape {shape}, expected (num_states,) or one such row a step")
         self.bands: tuple[Any, ...] = bands
         for d, band in enumerate(bands):
             self._check(d, band)

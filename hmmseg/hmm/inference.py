@@ -231,9 +231,8 @@ def _run(core: Core, log_likelihoods: Any, chain: Any, length: Any, *keys: Any,
         n = jnp.asarray(len(x) if length is None else length).astype(jnp.uint32).astype(jnp.int32)
         kind = x.dtype if jnp.issubdtype(x.dtype, jnp.floating) else jnp.dtype(float)
         if inside is not None:
-            return inside(
-                x.astype(kind), jax.tree.map(lambda leaf: jnp.asarray(leaf, kind), chain), n, parallel
-            )
+            cast = jax.tree.map(lambda leaf: jnp.asarray(leaf, kind), chain)
+            return inside(x.astype(kind), cast, n, parallel)
         result = core(x, chain, n, *keys, parallel=parallel, **static)[1]
         return jax.tree.map(lambda a: a.astype(kind) if a.dtype == jnp.float64 else a, result)
 
@@ -309,9 +308,8 @@ def run_many(core: Core, tables: Sequence[np.ndarray], chains: Sequence[Any], *k
     results: list[Any] = [None] * len(tables)
     for (size, *_), members in groups.items():
         whole = len(members) // TOGETHER * TOGETHER
-        parts = [members[i : i + TOGETHER] for i in range(0, whole, TOGETHER)] + [
-            [i] for i in members[whole:]
-        ]
+        parts = [members[i : i + TOGETHER] for i in range(0, whole, TOGETHER)]
+        parts += [[i] for i in members[whole:]]
         for part in parts:
             n = np.array([len(tables[i]) for i in part], np.int32)
             x = np.zeros((len(part), size, tables[part[0]].shape[1]))

@@ -119,9 +119,8 @@ def forward(x: Array, w: Array, initial: Array, n: Array, plus: Operation,
         def step(t: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
             table, *taken = carry
             before, weight = row(table, t - 1), row(w, t - 1)
-            now = reduce(plus, [forwards(before, d) + weight[d] for d in range(w.shape[1])]) + known(
-                row(x, t)
-            )
+            each = [forwards(before, d) + weight[d] for d in range(w.shape[1])]
+            now = reduce(plus, each) + known(row(x, t))
             if taken:
                 top = finite(now.max())
                 now, taken = now - top, [taken[0] + top]

@@ -72,9 +72,7 @@ class StreamingFilter:
         if not isinstance(chain, Chain):
             raise ValueError("chain: tables of durations, expected a Chain: they would need the whole stream")
         if chain.num_samples is not None:
-            raise ValueError(
-                "chain: varies in time, expected one that does not, as a stream has no known end"
-            )
+            raise ValueError("chain: varies in time, expected one that does not: streams have no known end")
         if lag < 0:
             raise ValueError(f"lag: {lag}, expected 0 or more samples")
         self.chain, self.lag = chain, lag
@@ -96,17 +94,15 @@ class StreamingFilter:
         missing = np.isnan(row)
         row = np.zeros(k) if missing.all() else row
         if (missing.any() and not missing.all()) or np.isposinf(row).any():
-            raise ValueError(
-                f"log_likelihood: {row.tolist()}, expected numbers or -inf (missing: NaN throughout)"
-            )
+            found = f"log_likelihood: {row.tolist()}"
+            raise ValueError(f"{found}, expected numbers or -inf (missing: NaN throughout)")
         first = np.asarray(self.chain.log_initial) if self.num_samples == 0 else np.full(k, -np.inf)
         with jax.enable_x64(True):
             before, gained, *smoothed = jax.tree.map(np.asarray, _update(self._before, self._w, first, row))
         if not math.isfinite(gained):
             reached = np.flatnonzero(np.isfinite(self._before[-1])).max(initial=-1)
-            raise InfeasibleAlignment(
-                min(int(reached) + 1, k - 1), f"no state is possible at sample {self.num_samples}"
-            )
+            why = f"no state is possible at sample {self.num_samples}"
+            raise InfeasibleAlignment(min(int(reached) + 1, k - 1), why)
         self._before = before
         self._log_evidence += float(gained)
         sample, self.num_samples = self.num_samples, self.num_samples + 1

@@ -18,9 +18,8 @@ from hmmseg.io.trial import ROLL, Trial
 from hmmseg.levels import GAP
 from hmmseg.online.answer import Answer, Crossing
 from hmmseg.online.filter import Filter
-from hmmseg.online.wrist import Wrist, checked
+from hmmseg.online.wrist import LAG, Wrist, checked
 
-LAG = 1.0  # chosen: s; default lag: contacts ring for a fifth of that
 SNAPSHOTS = 10  # numerics: points per lag to which a late row can return
 USUAL = 0.02  # numerics: update rate of the usual interval
 JUDGED = 20  # numerics: rows of which one is looked at for readings that no hand has

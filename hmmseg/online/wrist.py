@@ -210,7 +210,7 @@ def checked(rig: Rig, t: float, row: np.ndarray) -> None:
 
 
 STAND = 0.1  # chosen: s of almost no motion after which the gripper stands
-PATIENCE = 1.0  # chosen: s that samples are held back at most, as long as the default lag
+LAG = 1.0  # chosen: s; default lag, and the longest that samples are held back: contacts ring for less
 NOISE = 200  # numerics: samples that determine the opening's noise
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
 
@@ -281,7 +281,7 @@ class Opening(Closings):
 
     def _close(self, t: float, opening: float) -> None:
         """While closing, samples wait until the gripper stands."""
-        self.known = max(self.known, t - PATIENCE)
+        self.known = max(self.known, t - LAG)
         then = next((each for each in reversed(self._way) if t - each[0] >= STAND - 1e-9), None)
         if then is None:
             return
@@ -307,7 +307,7 @@ class Opening(Closings):
             self._wide, self.known = math.nan, t
         else:
             self._wide = t if math.isnan(self._wide) else self._wide
-            self.known = max(self.known, t - PATIENCE)
+            self.known = max(self.known, t - LAG)
             if not self.closing:
                 held.stop, self.known = self._wide, t
 

@@ -12,6 +12,7 @@ import tomlkit
 from hmmseg.contact.equations import rolled_offset
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, tip_velocity
 from hmmseg.io.rig import JOINTS
+from hmmseg.levels import SHOWN
 from simgap import channels
 from simgap.effect import Array, Parameter
 from simgap.effects.base import (
@@ -119,7 +120,6 @@ LINK_LENGTH = HandEffect(
 
 # Joints that turn within a dead band before the sensor follows.
 
-HUSH = 3.0  # chosen: sds of an angle that it must turn by before its joint counts as moving
 ANYWHERE = 4 / 3  # physics: mean square distance from a side of a band to anywhere in it, in half its width
 
 
@@ -134,7 +134,7 @@ def _moves(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     noise, constant at rest."""
     from simgap.recursions import play
 
-    hush = HUSH * _noise(joints)
+    hush = SHOWN * _noise(joints)
     calm = np.empty_like(joints)
     for trial, joint in np.ndindex(hush.shape):
         calm[trial, :, joint] = play(joints[trial, :, joint], 2 * hush[trial, joint])
@@ -165,7 +165,7 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     sample to the next it may have gone anywhere in the band. A band too narrow for motion to be detected has
     no effect.
     """
-    band = half * np.clip(2 * half / (HUSH * _noise(world.joints)[:, None]) - 1, 0.0, 1.0)
+    band = half * np.clip(2 * half / (SHOWN * _noise(world.joints)[:, None]) - 1, 0.0, 1.0)
     moves, calm = _moves(world.joints)
     (last, ago), (following, ahead) = _nearest_move(moves, False), _nearest_move(moves, True)
     rest = ago + ahead - 1
@@ -194,7 +194,7 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     far = np.pad(went_on, ((0, 0), (1, 0), (0, 0))) + np.pad(went_on, ((0, 0), (0, 1), (0, 0)))
     return DeadBand(
         place,
-        (last == following) & (rest == 1) & (far > HUSH * _noise(world.joints)[:, None]),
+        (last == following) & (rest == 1) & (far > SHOWN * _noise(world.joints)[:, None]),
         (1 - unseen) * np.diff(own, axis=1, prepend=own[:, :1]),
         np.broadcast_to((1 - unseen) * seen, place.shape),
         np.square(unseen * band[:, 0]) * ANYWHERE,

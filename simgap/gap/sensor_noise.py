@@ -9,6 +9,7 @@ import numpy as np
 
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Fingertip, Rig
+from hmmseg.levels import SHOWN
 from hmmseg.segmentation.emissions import noise_sd
 
 # Changes between two samples: jumps of velocities and accelerations, blocks pushed by fingers.
@@ -20,14 +21,13 @@ SEEN = 2.0  # prior: sds of a fourth difference below which it is noise
 FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)  # numerics: weights of a fourth difference
 MEDIAN = 0.4549  # physics: median of the square of a standard normal number
 JUMPS = 64  # numerics: moments between two samples that are averaged over
-MOVES = 3.0  # chosen: sds of a difference above which fingers move
 
 
 def changes(values: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Larger change (N, ...) to either neighbour in excess of `noise` (N,); zero where missing."""
     step = np.abs(np.nan_to_num(np.diff(values, axis=0)))
     step = np.pad(step, [(1, 1), *[(0, 0)] * (values.ndim - 1)])
-    usual = MOVES * np.sqrt(2.0) * noise.reshape(-1, *[1] * (values.ndim - 1))
+    usual = SHOWN * np.sqrt(2.0) * noise.reshape(-1, *[1] * (values.ndim - 1))
     return np.maximum(np.maximum(step[:-1], step[1:]) - usual, 0.0)
 
 

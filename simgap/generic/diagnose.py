@@ -172,8 +172,7 @@ def variances(lay: Layout, deviations: np.ndarray, index: np.ndarray) -> np.ndar
 
 
 def _common(given: Scene, channel: int) -> np.ndarray:
-    """Orthonormal ways (n, q) in which whole trials differ: offset, slope, size and time of the course, an
-    offset of each subtask, and loudness."""
+    """Orthonormal ways (n, q) in which trials differ: offset, slope, size, time, loudness, by subtask."""
     lay, t, x = given.layout, given.t, given.course[channel]
     slow = (lay.kind[lay.of_channel(channel)] == SLOW).astype(float)
     moved = [t, x, delayed(t, x, LATE) - x]  # a drift, a gain, a lag
@@ -280,8 +279,7 @@ def fit(
 def _fitted(
     given: Scene, root: np.ndarray, target: np.ndarray, mine: Sequence[Slot]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (k,) and derivatives (n, k) of the best fit from all starts: bounded least squares with
-    normal priors."""
+    """Coordinates (k,) and derivatives (n, k) of the best bounded fit from all starts, with normal priors."""
     priors, ends = np.eye(len(mine)), np.array([s.parameter.limits for s in mine]).T
     at = partial(shift_at, given, mine)
 

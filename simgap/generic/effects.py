@@ -160,8 +160,7 @@ def read(t: np.ndarray, values: np.ndarray, acting: Acting) -> np.ndarray:
 
 
 def _rung(given: Scene, t: np.ndarray, starts: np.ndarray, rung: np.ndarray) -> np.ndarray:
-    """A vibration (n,) at times t [s], excited at the subtasks' `starts` [s] with amplitudes `rung` (K,
-    2)."""
+    """A vibration (n,) at times t [s], excited at subtasks' `starts` [s] with amplitudes `rung` (K, 2)."""
     out = np.zeros(t.size)
     for k in np.flatnonzero(rung.any(1)):
         assert given.ring is not None
@@ -203,8 +202,7 @@ def _log_powers(given: Scene, channel: int, acting: Acting, rung: np.ndarray) ->
 
 
 def _as_read(given: Scene, cut: Cut, channel: int, acting: Acting, rung: np.ndarray) -> np.ndarray:
-    """A simulated trial's channel (n,) as recorded. The second before its start mirrors the first one: a held
-    value would have no noise."""
+    """A simulated trial's channel (n,) as recorded; before its start mirrored, as held values lack noise."""
     t, values = cut.trial.t, cut.trial.channels[given.layout.ensembles.channels[channel]]
     there = np.isfinite(values)
     values = values if there.all() else np.interp(t, t[there], values[there])

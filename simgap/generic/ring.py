@@ -1,6 +1,6 @@
 """A structure that rings after an event, found in recorded trials without a model of it.
 
-From the largest swing on, y(t) = parabola + exp(-damping w t) (A sin w t + B cos w t) with w = 2 pi f. A, B
+Once contacts have settled, y(t) = parabola + exp(-damping w t) (A sin w t + B cos w t) with w = 2 pi f. A, B
 and the parabola differ from trial to trial, f and damping are common. For given f and damping the fit is
 linear (variable projection: Golub & Pereyra, SIAM J. Numer. Anal. 10, 1973); these two are searched on a grid
 and refined. Intervals come from the scatter between trials (jackknife), which needs no noise model.
@@ -8,7 +8,6 @@ and refined. Intervals come from the scatter between trials (jackknife), which n
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,16 +15,14 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import stdtrit
 
+from hmmseg.levels import SETTLING
 from simgap.generic.trials import Layout, resampled, windowed
 
 LEAST = 4  # numerics: fewest coefficients in a mean power
 DAMPINGS = (0.003, 0.01, 0.03, 0.1, 0.2)  # numerics: grid of the search
 LIGHTEST, HEAVIEST = 1e-3, 0.25  # chosen: range of damping ratios that count as ringing
 FREQUENCIES = 80  # numerics: points of the search's grid
-SWING = 1 / 3  # chosen: first share of a window, searched for the largest swing
 SHORTEST = 12  # numerics: samples; an oscillation is searched for in no shorter window
-PERIODS = 1.5  # chosen: periods of the slowest oscillation that a window must hold
-HIGHEST = 0.4  # chosen: highest frequency searched, over the sampling rate
 SIMPLEX: dict[str, Any] = {  # numerics: of the search
     "method": "Nelder-Mead", "options": {"xatol": 1e-4, "fatol": 1e-7, "maxiter": 150},
 }  # fmt: skip
@@ -53,7 +50,8 @@ class Ring:
 def find_ring(lay: Layout) -> Ring | None:
     """The strongest oscillation after an event, where real trials have more power than simulated ones.
 
-    After the last event all that was recorded is searched, as what is compared may end sooner.
+    After the last event all that was recorded is searched, as what is compared may end sooner. Nothing is
+    searched within SETTLING of an event: what changes there with the contact would pass for damping.
     """
     kinds, best, found = (lay.ensembles.real, lay.ensembles.sim), 0.0, None
     last = len(lay.ensembles.subtasks) - 1
@@ -66,34 +64,23 @@ def find_ring(lay: Layout) -> Ring | None:
             if real.shape[1] < 4 * LEAST or real.var(1).mean() < sim.var(1).mean():
                 continue
             rest = real - sim.mean(0)  # what is simulated too is no ringing
-            windows = list(rest if rest.var(1).mean() < real.var(1).mean() else real)
+            windows = rest if rest.var(1).mean() < real.var(1).mean() else real
             if k == last and since.size:
-                windows = [resampled(cut.trial.t, cut.trial.channels[name], cut.edges[-2] + since, lay.rate)
-                           for cut in kinds[0]]  # fmt: skip
-            swings = from_swing(windows)
-            share = 1 - _screened(swings, lay.rate)[2]
-            strength = share * np.square(_detrended(swings)).sum() / (len(swings) * lay.scale[c] ** 2)
+                ends = ((cut.trial.t, cut.trial.channels[name], cut.edges[-2] + since) for cut in kinds[0])
+                windows = np.array([resampled(*end, lay.rate) for end in ends])
+            settled = windows[:, round(SETTLING * lay.rate) :]
+            share = 1 - _screened(settled, lay.rate)[2]
+            strength = share * np.square(_detrended(settled)).sum() / (len(settled) * lay.scale[c] ** 2)
             if share > RINGS and strength > best:
-                best, found = strength, swings
+                best, found = strength, settled
     return None if found is None else fit_ring(found, lay.rate)
-
-
-def from_swing(windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Windows (trials, n) of equal length, each from its largest swing on: the largest deviation from its
-    median in its first third."""
-    cut = []
-    for values in windows:
-        early = values[: max(int(values.size * SWING), 1)]
-        cut.append(values[int(np.abs(early - np.median(values)).argmax()) :])
-    n = min(v.size for v in cut)
-    return np.array([v[:n] for v in cut])
 
 
 def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
     """Fit the oscillation common to several windows.
 
     Args:
-        windows: Samples (trials, n), from a swing on.
+        windows: Samples (trials, n).
         rate: Sampling rate [Hz].
 
     Returns:
@@ -125,13 +112,12 @@ def fit_ring(windows: np.ndarray, rate: float) -> Ring | None:
 
 
 def _range(windows: np.ndarray, rate: float) -> tuple[float, float]:
-    """Lowest and highest frequency [Hz] that windows (trials, n) resolve."""
-    return PERIODS * rate / max(windows.shape[1], 1), HIGHEST * rate
+    """Frequencies [Hz] of one period in windows (trials, n), and of two samples a period (Nyquist's)."""
+    return rate / max(windows.shape[1], 1), rate / 2
 
 
 def _screened(windows: np.ndarray, rate: float) -> tuple[float, float, float]:
-    """Best frequency [Hz] and damping on a grid, and the share of the variance about each window's parabola
-    that they leave: 1 where windows are too short."""
+    """Best frequency [Hz] and damping on a grid, and the share of variance left; 1 of too short windows."""
     low, high = _range(windows, rate)
     if windows.shape[1] < SHORTEST or low >= high:
         return np.nan, np.nan, 1.0

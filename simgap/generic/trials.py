@@ -34,7 +34,7 @@ EVENT = 0.5  # chosen: s; that time, or a quarter of the shortest trial's subtas
 SUB_BANDS = 8  # chosen: sub-bands of fast power, evenly spaced in log frequency
 LOWEST = 6  # chosen: half periods per window at which fast power begins
 FEWEST = 3  # chosen: fewest DCT coefficients of a sub-band, and of a window's fast power
-FLOOR = 1e-4  # chosen: rms over a channel's scale, below which fast power counts as none
+FLOOR = 1e-4  # numerics: rms over a channel's scale that keeps logs of power finite; its tenth does too
 SLOW, FAST, DURATION = range(3)
 TASK_SPACE = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 
@@ -272,8 +272,7 @@ def _sub_bands(low: int, window: int) -> tuple[slice, ...]:
 
 
 def resampled(t: np.ndarray, values: np.ndarray, times: np.ndarray, rate: float) -> np.ndarray:
-    """Resample a signal with gaps at `times` (n,) [s]: averaged over 1 / rate if it was sampled much faster,
-    else interpolated."""
+    """Resample a signal with gaps at `times` (n,) [s]: averaged if sampled much faster, else interpolated."""
     known = np.isfinite(values)
     if 1 / np.median(np.diff(t)) < 1.5 * rate:
         return np.interp(times, t[known], values[known])

@@ -191,10 +191,8 @@ def sentences(body: Body) -> list[str]:
         others = ", or ".join(plain_name(n) for n in body["indistinguishable"])
         out.append(f"These recordings cannot tell it from {others}.")
         instead = {c: o for c, o in (body.get("stands_in") or {}).items() if o and len(body["causes"]) > 1}
-        out += [
-            f"In place of {plain_name(cause)} it may be {' or '.join(map(plain_name, others))}."
-            for cause, others in instead.items()
-        ]
+        for cause, rivals in instead.items():
+            out.append(f"In place of {plain_name(cause)} it may be {' or '.join(map(plain_name, rivals))}.")
     out += [t for t in (explained(body), shrunk(body)) if t]
     return out
 

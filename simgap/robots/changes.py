@@ -16,8 +16,8 @@ counted in rows. It is learned between motions:
 * *Which*: an explanation's energy is minus its log evidence (Laplace's, delta's prior a Cauchy in its
   coordinates) from the fit to all motions together. Rows count less by their dependence on each other, which
   OLD's motions show by how far each pulls theta. One motion says little of delta alone: a free swing tells
-  mass from length only because slower motions determine the friction. An explanation is ruled out where it is
-  less likely than RIVAL of the best, where odds below what a second small change of anything gains beyond the
+  mass from length only because slower motions determine the friction. An explanation is ruled out where the
+  best is RULED_OUT times as likely, where odds below what a second small change of anything gains beyond the
   best count for nothing: so much is model error.
 * *Whether*: a change is likelier than nothing by more than the number of candidates, and takes a share that
   matters of the energy and of what held-out motions of NEW are missed by. Model error in motions that OLD
@@ -43,6 +43,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from hmmseg.errors import InputError
+from simgap.attribution.verdict import ALARM, RULED_OUT
 from simgap.progress import Progress, silent
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.calibrate import LONGEST, Calibration, calibrate
@@ -77,8 +78,6 @@ CHANGED = 0.03  # chosen: share of unchanged robots that may be called changed
 MATTERS = 0.1  # chosen: share of NEW's loss that a change must take; less may differ from day to day
 DRIFT = 0.1  # prior: share of a parameter, or of its usual size, by which a fitted one differs in NEW
 RESPONSE = 0.03  # prior: share of a change by which a model answers it wrongly in all motions alike
-RIVAL = 0.05  # chosen: share of right explanations that a wrong one may rule out
-UNKNOWN = 0.01  # chosen: share of unchanged robots whose misfit may be called unknown
 
 
 @dataclass(frozen=True)
@@ -538,12 +537,12 @@ def _concluded(
     least = best.energy + slack
     alike = [c for c in (singles, pairs)[len(best.effects) == 2] if c is not best and best.effects]
     weight = {"+".join(sorted(c.effects)): float(np.exp(min(least - c.energy, 0.0))) for c in alike}
-    others = [c for c in alike if weight["+".join(sorted(c.effects))] > RIVAL]
+    others = [c for c in alike if weight["+".join(sorted(c.effects))] > 1 / RULED_OUT]
     excess = found.excess(best)
     p_value = found.chance(best, nothing) if best.effects else 1.0
     worse = by_chance(excess) if found.paired else _unlike(best.left, old.missed)
     verdict = "none" if not best.effects else "set" if others else "named"
-    if worse < UNKNOWN and excess.mean() > (nothing.left - best.left).mean():
+    if worse < ALARM and excess.mean() > (nothing.left - best.left).mean():
         verdict = "unknown"
     chances = _chances(best, weight, p_value, worse)
     return Changes(
@@ -573,7 +572,7 @@ def _chances(best: Change, weight: Mapping[str, float], p_value: float, worse: f
         p = max(p, 1e-12)
         return 1.0 if p >= math.exp(-1) else -math.e * p * math.log(p)
 
-    none, unknown = odds(p_value) if best.effects else 1.0, odds(UNKNOWN) / (odds(UNKNOWN) + odds(worse))
+    none, unknown = odds(p_value) if best.effects else 1.0, odds(ALARM) / (odds(ALARM) + odds(worse))
     every = {**weight, **({"+".join(sorted(best.effects)): 1.0} if best.effects else {})}
     total = max(sum(every.values()), 1e-300)
     seen = 1 - none / (1 + none) if best.effects else 0.0

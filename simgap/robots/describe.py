@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from hmmseg.levels import SHOWN
 from simgap.attribution.verdict import entries, rows
 from simgap.robot_effects.base import entry
 from simgap.robots.diagnose import RobotDiagnosis
 from simgap.robots.search import FittedSet
-
-SEEN = 3.0  # chosen: standard deviations of the noise's squares; a phase with a smaller gap has none
 
 
 def body(found: RobotDiagnosis) -> dict[str, Any]:
@@ -142,6 +141,6 @@ def _by_phase(found: RobotDiagnosis, units: dict[str, str]) -> dict[str, Any]:
         gap = before - mine.sum()
         was, now = rows.rms(far.plain, mine), rows.rms(far.residual, mine)
         left = {n: {"before": was[n], "after": now[n], "unit": units[n]} for n in was}
-        stands_out = gap > SEEN * np.sqrt(2 * mine.sum())
+        stands_out = gap > SHOWN * np.sqrt(2 * mine.sum())
         out[name] = {"fraction": float((before - after) / gap) if stands_out else None, "rms": left}
     return out

@@ -68,9 +68,8 @@ def test_few_residuals_are_no_less_noisy_than_the_rig_states_but_by_chance():
     assert (shy.variance["force"] == pytest.approx(expected)
             and shy.count["force"] == observations.STATED + own)  # fmt: skip
     # What is recorded may be noisier than its sensors.
-    assert observations.estimated_noise(
-        {"force": loud}, {"force": 3.0}, {"force": 1.0}
-    ) == observations.estimated_noise({"force": loud}, {"force": 3.0}, {})
+    heard, told = ({"force": loud}, {"force": 3.0}), observations.estimated_noise
+    assert told(*heard, {"force": 1.0}) == told(*heard, {})
     none = observations.estimated_noise({"force": [(np.array([0.1]), np.ones(1))]}, {"force": 1.0},
                                         {"force": 0.2})  # fmt: skip
     assert none.variance["force"] == pytest.approx(0.04) and none.count["force"] == observations.STATED
@@ -97,9 +96,8 @@ def test_drawn_boundaries_follow_their_posterior_and_keep_order():
     object.__setattr__(trial, "boundaries", (one, one))
     drawn = observations.draw_boundaries(trial, rng, 20_000)
     assert (np.diff(drawn, axis=1) >= 0).all()
-    assert drawn[:, 0].mean() == pytest.approx(0.4, abs=2e-3) and drawn[:, 0].std() == pytest.approx(
-        0.05, rel=0.03
-    )
+    assert drawn[:, 0].mean() == pytest.approx(0.4, abs=2e-3)
+    assert drawn[:, 0].std() == pytest.approx(0.05, rel=0.03)
 
 
 def test_pads_give_is_taken_out_and_gravity_grows_by_the_acceleration():

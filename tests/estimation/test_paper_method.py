@@ -126,9 +126,8 @@ def test_a_move_that_never_happens_fails_at_its_pickup_though_a_grip_flickers():
 
 
 def test_refused_input():
-    refused(
-        r"--force-threshold: found 0\.0; expected a number > 0", segment, "111", PICK, force_threshold=0.0
-    )
+    line = r"--force-threshold: found 0\.0; expected a number > 0"
+    refused(line, segment, "111", PICK, force_threshold=0.0)
     refused("--velocity-threshold: found nan", segment, "111", PICK, velocity_threshold=math.nan)
     refused("plain ordered task", segment, "111", SequenceTask(("a", "b")))
 

@@ -71,9 +71,8 @@ def test_numbers_are_saved_as_recorded_without_nan_and_read_back(case, monkeypat
     for which in ("one", "all"):
         for name in sources.BLOCKS:
             for key in estimates.KEYS:
-                assert saved[which][name][key]["mean"] == pytest.approx(
-                    fresh[which][name][key]["mean"], rel=1e-5
-                )
+                old, new = (found[which][name][key]["mean"] for found in (saved, fresh))
+                assert old == pytest.approx(new, rel=1e-5)
     assert results.load("states")["recordings"] == json.loads(json.dumps(recording.trials(case)))
     monkeypatch.setattr(sources, "RESULTS", tmp_path)
     sources.save("some", {"a": np.array([1.23456789, np.nan, -0.0]), "b": [{"c": True, "d": np.int64(3)}],

@@ -116,10 +116,8 @@ def test_what_a_bag_lacks_is_listed_and_the_rest_is_read(tmp_path):
     folder = bag_of(tmp_path / "log", planted())
     with sqlite3.connect(next(folder.glob("*.db3"))) as base:
         base.execute("UPDATE topics SET type = 'lab_msgs/msg/Motor' WHERE name = '/opening'")
-    assert (
-        "topic /opening cannot be decoded (the bag does not define its type lab_msgs/msg/Motor)"
-        in "".join(read_table(folder).notes)
-    )
+    line = "topic /opening cannot be decoded (the bag does not define its type lab_msgs/msg/Motor)"
+    assert line in "".join(read_table(folder).notes)
     assert read_trial(folder, TOPICS, LOGGED).warnings == ()
     rig = parse_rig({"topics": {"w": "/opening.data"}})
     refused(r"log: topic /opening: cannot be decoded \(the bag does not define", read_trial, folder, rig,
@@ -151,9 +149,8 @@ def test_columns_of_other_lengths_are_read_apart(tmp_path):
     (1e6, "sampled at 0.0001 Hz if it is in s: it looks like us"), (1.0, None)])  # fmt: skip
 def test_stamps_since_1970_in_another_unit_are_refused_in_any_recording(tmp_path, size, line):
     t = ((START * 1e-9 + np.arange(40) * 0.01) * size).round(2)
-    pd.DataFrame({"t": t.astype(np.int64) if size > 1 else t, "x": np.arange(40.0)}).to_csv(
-        tmp_path / "a.csv", index=False
-    )
+    table = pd.DataFrame({"t": t.astype(np.int64) if size > 1 else t, "x": np.arange(40.0)})
+    table.to_csv(tmp_path / "a.csv", index=False)
     task = SequenceTask(("a", "b"))
     if line is None:
         assert read_trial(tmp_path / "a.csv", task=task).warnings == ()

@@ -161,9 +161,8 @@ def test_optional_states_may_be_passed_over():
     np.testing.assert_allclose(posterior.log_evidence, log_evidence)
     np.testing.assert_allclose(posterior.smoothed, smoothed, atol=1e-12)
     # Who goes from 0 to 3 crosses all three boundaries at once.
-    np.testing.assert_allclose(
-        posterior.boundary[:, 1], moves[0][:, 1] + moves[1][:, :2].sum(1) + moves[2][:, 0], atol=1e-12
-    )
+    crossed = moves[0][:, 1] + moves[1][:, :2].sum(1) + moves[2][:, 0]
+    np.testing.assert_allclose(posterior.boundary[:, 1], crossed, atol=1e-12)
     # Without evidence, a recording of any length visits the states as often as was said.
     flat = hmm.smooth(np.zeros((400, 4)), chain)
     visits = flat.smoothed[0] + np.array([sum(m[:, k - d].sum() for d, m in enumerate(flat.moves, 1)
@@ -419,9 +418,8 @@ def test_a_refused_sample_leaves_the_stream_as_it_was(presence):
     for row in ll:
         expected = clean.update(row)
         for bad, line in wrong:
-            refused(
-                line, stream.update, bad, error=hmm.InfeasibleAlignment if "state" in line else ValueError
-            )
+            kind = hmm.InfeasibleAlignment if "state" in line else ValueError
+            refused(line, stream.update, bad, error=kind)
         np.testing.assert_array_equal(stream.update(row).filtered, expected.filtered)
     early = hmm.StreamingFilter(hmm.left_to_right([2.0, 2.0, 2.0]), 1)
     early.update([0.0, 0.0, 0.0])

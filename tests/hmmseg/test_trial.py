@@ -64,9 +64,8 @@ def test_every_kind_of_file_or_table_holds_the_same_trial_and_nulls_are_missing(
     ours = scene()
     for make in (dict, pd.DataFrame, pl.DataFrame):
         assert_same(read_trial(make(ours), parse_rig({})), pd.DataFrame(ours))
-    frame = pl.DataFrame(ours).with_columns(
-        pl.when(pl.arange(pl.len()) == 3).then(None).otherwise(pl.col("fx1")).alias("fx1")
-    )
+    gone = pl.when(pl.arange(pl.len()) == 3).then(None).otherwise(pl.col("fx1")).alias("fx1")
+    frame = pl.DataFrame(ours).with_columns(gone)
     assert np.flatnonzero(np.isnan(read_trial(frame, parse_rig({})).channels["fx1"])).tolist() == [3]
 
 
@@ -562,11 +561,8 @@ def test_a_slide_tells_friction_and_weight_together_or_friction_of_a_known_weigh
     # Coulomb's law at several loads is a line: its slope and intercept tell friction and weight.
     for name in ("weight", "friction_on_ground"):
         (evidence,) = found.properties["a"][name].evidence
-        assert (evidence.subtasks, evidence.bound, evidence.condition) == (
-            (2,),
-            False,
-            decomposing.VARYING_LOAD,
-        )
+        found_in = evidence.subtasks, evidence.bound, evidence.condition
+        assert found_in == ((2,), False, decomposing.VARYING_LOAD)
         assert evidence.signals() == ("horizontal forces", "vertical forces")
     assert found.properties["a"]["width"].kind == "value"
     found = decompose(BlockTask({"a": GROUND}, (Move("a", GROUND), Move("a", GROUND, slide=True))))
@@ -620,9 +616,8 @@ def test_heights_agree_with_stacking_and_rank_and_every_property_has_evidence_or
     for (index, rise), move in zip(height_equations(task), task.moves, strict=True):
         before = bottom(move.object)
         support[move.object] = move.to
-        assert sum(heights[name] * c for name, c in rise.items()) == pytest.approx(
-            bottom(move.object) - before
-        )
+        risen = sum(heights[name] * c for name, c in rise.items())
+        assert risen == pytest.approx(bottom(move.object) - before)
         matrix[index, [task.objects.index(name) for name in rise]] = list(rise.values())
     free = np.abs(null_space(matrix)).max(axis=1, initial=0.0) > 1e-9
     found = decompose(task)

@@ -9,7 +9,6 @@ import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from types import SimpleNamespace as NS
 
 import numpy as np
@@ -316,12 +315,12 @@ def test_motions_are_written_as_logs_have_them_and_pages_in_their_units():
 
 def test_rerun_gets_three_courses_of_each_channel(tmp_path, monkeypatch):
     sent = []
-    stream = SimpleNamespace(
+    stream = NS(
         save=lambda path: None, flush=lambda: None,
         send_columns=lambda entity, indexes, columns: sent.append((entity, *indexes, columns)),
     )  # fmt: skip
-    fake = SimpleNamespace(RecordingStream=lambda name: stream, TimeColumn=lambda name, duration: duration,
-                           Scalars=SimpleNamespace(columns=lambda scalars: scalars))  # fmt: skip
+    fake = NS(RecordingStream=lambda name: stream, TimeColumn=lambda name, duration: duration,
+                           Scalars=NS(columns=lambda scalars: scalars))  # fmt: skip
     monkeypatch.setitem(sys.modules, "rerun", fake)
     t = np.array([0.0, np.nan, 1.0])
     write_rerun(tmp_path / "a.rrd", [Course("a.csv", "q", "deg", t, t, t + 1, t + 2, 1.0)])

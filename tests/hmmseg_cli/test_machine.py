@@ -140,17 +140,13 @@ def tortured(lab, name, kind, monkeypatch, capsys, most):
     return count.calls
 
 
-@pytest.mark.parametrize("kind", CALLS)
-@pytest.mark.parametrize("name", QUICK)
-def test_whatever_call_is_refused(name, kind, lab, monkeypatch, capsys):
-    tortured(lab, name, kind, monkeypatch, capsys, 6)
+EVERY = {name: 10_000 for name in COMMANDS} | {"watch": 30, "diagnose": 5}  # calls that are refused at most
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", CALLS)
-@pytest.mark.parametrize("name", COMMANDS)
-def test_whichever_call_is_refused(name, kind, lab, monkeypatch, capsys):
-    most = {"watch": 30, "diagnose": 5}.get(name, 10_000)  # how many calls are refused at most
+@pytest.mark.parametrize(("name", "most"), [*((name, 6) for name in QUICK), *(
+    pytest.param(*each, marks=pytest.mark.slow) for each in EVERY.items())])  # fmt: skip
+def test_whatever_call_is_refused(name, most, kind, lab, monkeypatch, capsys):
     tortured(lab, name, kind, monkeypatch, capsys, most)
 
 

@@ -73,9 +73,8 @@ def test_what_a_form_or_a_rig_admits_is_its_own_parameter_or_a_nuisance(healthy)
     values = own(given, one, "force_gain")
     assert values["gain"] == 0 and values["fx1"] == 0 and values["finger1"] != 0
     frame = read("none_1")
-    rig = frame.rig.model_copy(
-        update={"systematic": frame.rig.systematic.model_copy(update={"force_bias": (0.02, 0.0, 0.0, 0.01)})}
-    )
+    biased = frame.rig.systematic.model_copy(update={"force_bias": (0.02, 0.0, 0.0, 0.01)})
+    rig = frame.rig.model_copy(update={"systematic": biased})
     given = with_nuisances(problem(replace(frame, rig=rig)))
     k = given.num_common
     push = fit(given, ("force_bias",), neutral(given), steps=0).jacobian[:, k:]

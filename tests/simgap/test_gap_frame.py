@@ -98,9 +98,8 @@ def test_noise_of_a_jointed_finger_is_of_its_pose_and_of_means_of_speeds_quieter
     np.testing.assert_allclose(one["y"], s.sd_y)
     assert np.ptp(one["y"]) > 0.05 * one["y"].mean() and np.ptp(one["force"]) == 0
     np.testing.assert_allclose(sensor_noise.sample_noise(s, 4)["y"], s.sd_y / 2)
-    np.testing.assert_allclose(
-        sensor_noise.channel_noise(one)[:, CHANNELS.index("distance")], np.sqrt(2) * s.sd_x
-    )
+    apart = sensor_noise.channel_noise(one)[:, CHANNELS.index("distance")]
+    np.testing.assert_allclose(apart, np.sqrt(2) * s.sd_x)
 
 
 def grips(first: list[float]) -> np.ndarray:
@@ -119,9 +118,7 @@ def test_a_grip_is_firm_by_what_it_usually_is(grip, holds):
 def test_a_grip_is_firm_where_it_is_usual_and_a_start_off_a_support_is_in_doubt():
     assert (grips([])[10:] > 0.95).all()
     grip = np.full((1, 20), 0.5 * residuals.HELD)
-    assert (
-        np.asarray(residuals.firmness(grip, np.ones_like(grip), np.asarray(MOVES))) < 0.1
-    ).all() and 0 < residuals.LOOSE < 1
+    assert (residuals.firmness(grip, np.ones_like(grip), MOVES) < 0.1).all() and 0 < residuals.LOOSE < 1
     t, force = np.arange(12) * 0.05, np.zeros((12, 4))
     force[6:, 1] = 0.8  # N; the weight comes onto one finger within a sample
     free, starting = np.zeros(12, bool), t == t[6]
@@ -269,9 +266,8 @@ def test_the_doubt_of_a_kink_is_as_large_as_the_rules_are_off(group):
 
 def test_noise_smooth_motion_and_pushes_have_no_kinks_and_touches_no_speeds():
     rng, t = np.random.default_rng(0), 0.05 * np.arange(4000)
-    assert (
-        sensor_noise.kinks(1e-3 * rng.standard_normal(4000), np.full(4000, 1e-3)) > 0
-    ).mean() < 0.25  # largest of five
+    found = sensor_noise.kinks(1e-3 * rng.standard_normal(4000), np.full(4000, 1e-3))
+    assert (found > 0).mean() < 0.25  # largest of five
     assert sensor_noise.kinks(0.1 * np.sin(3 * t), np.full(4000, 1e-3)).max() == 0
     place = np.where(np.arange(40) < 20, 0.0, 2e-3)
     push = sensor_noise.changes(place, np.full(40, 2e-5))

@@ -217,9 +217,8 @@ def softer(true: float, swing: float, seed: int = 0, error: float = 0.0) -> Gap:
     draws, columns = [], None
     for kept in (True, False, False, False, False):
         f_noise, p_noise = FORCE_SD * rng.standard_normal(n), PLACE_SD * rng.standard_normal(n)
-        one = (
-            np.stack([p_noise - GIVE * f_noise, np.zeros(n), f_noise], 1) / sd
-        )  # residual, shift, derivative
+        # residual, shift, derivative
+        one = np.stack([p_noise - GIVE * f_noise, np.zeros(n), f_noise], 1) / sd
         if kept:
             columns = np.stack([place - GIVE * force, np.zeros(n), force], 1) / sd + one
         else:
@@ -322,9 +321,8 @@ def test_most_of_the_rounding_of_a_moving_force_shows_whatever_its_speed(size, r
     left = read - force - rounding_error(read[:, None], 1.0)[:, 0]
     assert np.var(left) < 0.5 * np.var(read - force)
     assert size < 2 or rounding_step([read[:500], read[500:]]) == pytest.approx(1.0, rel=1e-3)
-    flat = np.stack(
-        [np.full(600, 3.0), np.where(t < 300, -2.0, 5.0)], 1
-    )  # nothing shows of what rests or jumps
+    # nothing shows of what rests or jumps
+    flat = np.stack([np.full(600, 3.0), np.where(t < 300, -2.0, 5.0)], 1)
     assert rounding_step([force[:, None]]) == 0.0 and np.abs(rounding_error(flat, 1.0)).max() < 1e-9
 
 

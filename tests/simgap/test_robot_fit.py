@@ -73,9 +73,8 @@ def test_a_fit_and_a_search_come_back_from_where_the_simulator_diverges(damped):
     best = replace(nothing, names=names, point={n: e.neutral() for n, e in damped.effects.items()})
     for out in names:
         rest = tuple(n for n in names if n != out)
-        search.fitted[frozenset(rest)] = replace(
-            nothing, names=rest, linear=replace(nothing.linear, moved={}, diverged=rest), score=-np.inf
-        )
+        far = replace(nothing.linear, moved={}, diverged=rest)
+        search.fitted[frozenset(rest)] = replace(nothing, names=rest, linear=far, score=-np.inf)
     assert search._exchange(best) is None
 
 
@@ -454,12 +453,9 @@ SIMULATOR = checked(Servo(0.5, 0.12, 16.0), "servo.py:Servo")
 def recorded(motion: str, seed: int, changed: dict[str, float]) -> Recording:
     """A log of 2 s at 50 Hz of the servo with its true parameters."""
     t = np.arange(100) / 50
-    goal = {
-        "slow": 1.2 * np.sin(1.5 * t),
-        "slower": 0.9 * t / 2,
-        "slowest": -0.7 * np.sin(0.8 * t), "fast": 0.8 * np.sin(7 * t), "step": np.where(t > 0.4, 1.3, 0.0),
-        "drop": np.where(t < 1, 1.4 * np.minimum(t / 0.8, 1), 1.4),
-    }[motion]  # fmt: skip
+    goal = {"slow": 1.2 * np.sin(1.5 * t), "slower": 0.9 * t / 2, "slowest": -0.7 * np.sin(0.8 * t),
+            "fast": 0.8 * np.sin(7 * t), "step": np.where(t > 0.4, 1.3, 0.0),
+            "drop": np.where(t < 1, 1.4 * np.minimum(t / 0.8, 1), 1.4)}[motion]  # fmt: skip
     on = np.where((motion == "drop") & (t > 1), 0.0, 1.0)
     columns = {"goal": goal, "volts": np.full(t.size, 12.0), "on": on, "position": np.zeros(t.size)}
     nominal = {n: p.nominal for n, p in SIMULATOR.parameters.items()} | TRUE | changed
@@ -507,9 +503,7 @@ def test_a_gain_doubled_is_named_with_its_ratio():
     low, high = size["ratio_90"]
     assert low <= 2.0 <= high and size["ratio"] == pytest.approx(2.0, rel=0.03)
     body = found.body()
-    assert body["changes"][0].startswith("gain +") and body["effects"]["gain"]["parameters"].keys() == {
-        "gain"
-    }
+    assert body["changes"][0].startswith("gain +") and {*body["effects"]["gain"]["parameters"]} == {"gain"}
     pair = replace(found.best, effects=("gain", "mass"), **{n: np.repeat(getattr(found.best, n), 2) for n in
                    ("x", "sd", "freedom")})  # fmt: skip
     both = replace(found, best=pair).body()["effects"]
@@ -614,9 +608,8 @@ def test_gains_and_unlike_motions_are_judged_by_chance():
     gains = np.array([0.3, 0.1, 0.5, -0.1])
     assert comparing.by_chance(gains) == pytest.approx(ttest_1samp(gains, 0, alternative="greater").pvalue)
     rng = np.random.default_rng(0)
-    found = np.array(
-        [comparing._unlike(np.exp(rng.normal(size=2)), np.exp(rng.normal(size=3))) for _ in range(2000)]
-    )
+    drawn = [[np.exp(rng.normal(size=n)) for n in (2, 3)] for _ in range(2000)]
+    found = np.array([comparing._unlike(*each) for each in drawn])
     assert np.mean(found < 0.1) == pytest.approx(0.1, abs=0.02)
 
 

@@ -420,9 +420,8 @@ def test_logs_may_have_their_own_name_for_time_and_columns_at_a_slower_rate(tmp_
     path.write_text("t,x,y\n" + "".join(f"{0.01 * i:.2f},{fast[i]:.6f},{'' if i % 2 else f'{slow[i]:.6f}'}\n"
                                         for i in range(200)))  # fmt: skip
     log = read_recording(path, ["x", "y"])
-    assert np.isfinite(log["x"]).all() and np.flatnonzero(np.isfinite(log["y"])).tolist() == [
-        *range(0, 200, 2)
-    ]
+    assert np.isfinite(log["x"]).all()
+    assert np.flatnonzero(np.isfinite(log["y"])).tolist() == [*range(0, 200, 2)]
     assert log["y"][::2] == pytest.approx(slow[::2], abs=1e-6)
     assert estimate_noise([log], "y") == pytest.approx(1.0, rel=0.3)  # filled in between, it was nothing
 

@@ -34,6 +34,14 @@ from simgap.simulators.protocol import Channel, Parameter
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import checked
 
+mujoco = pytest.importorskip("mujoco")
+
+from simgap.simulators.mjcf.engine import rollout  # noqa: E402
+from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
+from simgap.simulators.mjcf.load import load_mjcf  # noqa: E402
+from simgap.simulators.mjcf.model import closed  # noqa: E402
+from simgap.simulators.mjcf.transmission import Motion, periods  # noqa: E402
+
 NAMES = ("a", "b", "c")
 
 
@@ -240,9 +248,8 @@ def composed(errors: np.ndarray, rng: np.random.Generator, paces=None) -> Compos
 def misses(seed: int, shared: bool, repeats: bool) -> float:
     """By how many of its own sd the size is missed."""
     rng = np.random.default_rng(seed)
-    factor = SIZE * np.linalg.cholesky(
-        np.exp(-np.abs(TIMES[:, None] - TIMES) / TAU) + 1e-9 * np.eye(TIMES.size)
-    )
+    alike = np.exp(-np.abs(TIMES[:, None] - TIMES) / TAU) + 1e-9 * np.eye(TIMES.size)
+    factor = SIZE * np.linalg.cholesky(alike)
     own = factor @ rng.standard_normal((TIMES.size, 1 if shared else LOGS))
     made = composed(np.broadcast_to(own.T, (LOGS, TIMES.size)), rng)
     made = made if repeats else replace(made, motion=())
@@ -327,9 +334,6 @@ def test_offsets_turn_with_the_body_and_each_log_has_its_own_shift():
 
 
 def test_brief_touches_count_but_breaks_do_not_and_what_slows_down_does_not_rest():
-    pytest.importorskip("mujoco")
-    from simgap.simulators.mjcf.model import closed
-
     t = np.arange(12) * 0.01
     pair, none = frozenset({(0, 1)}), frozenset()
     sets = [none, none, pair, none, none, none, none, none, pair, none, pair, none]
@@ -350,9 +354,6 @@ DROP = """<mujoco><option timestep="0.002"/><worldbody>
 @pytest.fixture(scope="module")
 def dropped(tmp_path_factory):
     """A model of a cube and a log of its fall and rest, read on a scale of 0.97."""
-    mujoco = pytest.importorskip("mujoco")
-    from simgap.simulators.mjcf.load import load_mjcf
-
     folder = tmp_path_factory.mktemp("drop")
     (folder / "cube.xml").write_text(DROP, encoding="utf-8")
     text = "".join(f'[columns.{a}]\nbody = "cube"\naxis = "{a}"\n' for a in POSE)
@@ -387,9 +388,6 @@ def test_flight_and_contact_are_told_apart(dropped):
 
 def test_a_stop_that_is_reached_and_left_is_a_contact_and_one_that_is_never_left_is_none(tmp_path):
     """A swing of 3.2 rad in a range of 3 is beyond it where |sin| exceeds 3 / 3.2."""
-    pytest.importorskip("mujoco")
-    from simgap.simulators.mjcf.load import load_mjcf
-
     body = '<joint name="j" range="-3 3"/><geom size=".1" pos="0 0 -1"/>'
     xml = f'<mujoco><compiler angle="radian"/><worldbody><body>{body}</body></worldbody></mujoco>'
     (tmp_path / "swing.xml").write_text(xml, encoding="utf-8")
@@ -459,9 +457,6 @@ TURN = '[columns.q]\njoint = "turn"\n[columns.u]\nactuator = "servo"\nunit = "ra
 
 
 def test_in_contact_a_fourth_of_the_step_by_another_integrator_is_the_run_itself(tmp_path):
-    pytest.importorskip("mujoco")
-    from simgap.simulators.mjcf.load import load_mjcf
-
     def load(step: float, integrator: str):
         (tmp_path / "arm.xml").write_text(ARM.format(step, integrator))
         (tmp_path / "map.toml").write_text(TURN)
@@ -480,12 +475,6 @@ def test_in_contact_a_fourth_of_the_step_by_another_integrator_is_the_run_itself
         own = finer.simulator.simulate({}, log.window(window.first, window.end), start)
         np.testing.assert_allclose(ours["q"], own["q"], atol=1e-9)
 
-
-mujoco = pytest.importorskip("mujoco")
-
-from simgap.simulators.mjcf.engine import rollout  # noqa: E402
-from simgap.simulators.mjcf.laws import Laws, run  # noqa: E402
-from simgap.simulators.mjcf.transmission import Motion, periods  # noqa: E402
 
 INERTIA, REACH, MASS = 0.02, 0.1, 0.5
 ROTOR = INERTIA - MASS * REACH**2 - 1e-4
@@ -516,9 +505,8 @@ def swung(gravity=True, angle=0.0, rate=0.0, torque=0.0, seconds=0.2, **laws):
 
 def test_friction_by_load_holds_at_rest_up_to_its_limit():
     weight = MASS * 9.81 * REACH * np.sin(0.5)
-    held, _, _ = swung(
-        angle=0.5, load_friction=2.1
-    )  # half of that of the weight: 1.05 times as much as holds
+    # half of that of the weight: 1.05 times as much as holds
+    held, _, _ = swung(angle=0.5, load_friction=2.1)
     assert np.abs(held - 0.5).max() < 3e-3  # MuJoCo's friction creeps, by 12 mrad/s here
     _, rate, t = swung(angle=0.5, load_friction=1.5, seconds=0.02)
     assert rate[-1] / t[-1] == pytest.approx(-(weight - 0.75 * weight) / INERTIA, rel=0.03)

@@ -164,9 +164,8 @@ def test_what_cannot_be_performed_or_held_is_no_silent_success():
     assert np.isnan(simulate_trials(STACK, HAND, [slippery], [0])[0].boundaries).any()
     one = [{"block1": PAPER_BLOCKS["block1"]}]
     refused("'block2' is missing", simulate_trials, STACK, HAND, one, [0])
-    refused(
-        r"grip\n.*expected \(low, high\), low <= high", OperatorSettings, grip=(3.0, 1.0), error=ValueError
-    )
+    line = r"grip\n.*expected \(low, high\), low <= high"
+    refused(line, OperatorSettings, grip=(3.0, 1.0), error=ValueError)
     short = {i: Finger(base=f.base, links=(0.08, 0.08)) for i, f in (HAND.fingers or {}).items()}
     other = HAND.model_copy(update={"fingers": short})
     refused("finger 1", simulate_trials, STACK, other, [PAPER_BLOCKS], [0])

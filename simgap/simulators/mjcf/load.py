@@ -316,8 +316,7 @@ TIMES = 100.0  # limit: how many times as far as its log a slide may move in a m
 
 
 def _check_travel(simulator: MjcfSimulator, log: Recording, file: str) -> None:
-    """InputError where a slide without a range moves so much less or more in the log than in the model under
-    its commands that the unit must be another; units are never guessed."""
+    """InputError where a slide without a range moves so unlike the model that the unit must be another."""
     model = simulator.model
     slides = {c: j for c, j in simulator.joints.items() if int(model.jnt_type[j]) == SLIDE}
     slides = {c: j for c, j in slides.items() if not model.jnt_limited[j]}
@@ -330,20 +329,14 @@ def _check_travel(simulator: MjcfSimulator, log: Recording, file: str) -> None:
     jobs = [Job({}, p, {**b, **{n + RATE: 0.0 for n in b}}) for p, b in zip(pieces, begun, strict=True)]
     runs = [(p, run) for p, run in zip(pieces, simulator.simulate_many(jobs), strict=True) if run is not None]
     for column, joint in slides.items() if runs else ():
-        seen, made = (
-            np.concatenate([v[column] - v[column][0] for v in each])
-            for each in (
-                [{column: whole[column][p.first : p.first + size]} for p, _ in runs],
-                [r for _, r in runs],
-            )
-        )
+        pairs = [(whole[column][p.first : p.first + size], run[column]) for p, run in runs]
+        seen, made = (np.concatenate([v - v[0] for v in each]) for each in zip(*pairs, strict=True))
         noise = white_sd(whole[column], 2)
         far, model_far = (float(np.sqrt(np.mean(v**2))) for v in (seen, made))
         for less, more, unit in ((far, model_far, "m"), (model_far, far, "mm")):
             if more > TIMES * less and far > 10 * noise and seen @ made > 0:
-                found = (
-                    f"moves {far:.2g} m in {PIECE:g} s, and joint {setting.name_of(model, 'joint', joint)}"
-                )
+                name = setting.name_of(model, "joint", joint)
+                found = f"moves {far:.2g} m in {PIECE:g} s, and joint {name}"
                 found = f"{found} of the model {model_far:.2g} m under the same commands"
                 raise InputError(f"{file}: column {column}", found, f'unit = "{unit}" in the map?')
 

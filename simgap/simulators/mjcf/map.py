@@ -68,10 +68,8 @@ class Mapped(Quantity):
         if len(named) != 1:
             found = f"names {' and '.join(named)}" if named else "names no thing of the model"
             raise ValueError(f"{found}; expected one of {', '.join(KINDS)}")
-        for key, known in (
-            ("kind", KINDS[self.thing]),
-            ("axis", POSE if self.thing in ("body", "site") else ()),
-        ):
+        axes = POSE if self.thing in ("body", "site") else ()
+        for key, known in (("kind", KINDS[self.thing]), ("axis", axes)):
             if known and getattr(self, key) not in known:
                 found = f"{key} {getattr(self, key)!r} of a {self.thing}"
                 raise ValueError(f"{found}; expected one of {', '.join(known)}")

@@ -179,8 +179,7 @@ class MjcfSimulator:
         return rested if still else first
 
     def along(self, log: Recording) -> np.ndarray:
-        """Full physics states (num_timesteps, size) along a log: columns where they tell, the rest as the
-        model runs it freely."""
+        """Full physics states (num_timesteps, size) along a log: columns where they tell, else a free run."""
         if not (self._partial or self._ties):
             ran = np.tile(self._own_state(log), (len(log), 1))
         else:

@@ -92,9 +92,8 @@ def body_rate(quat: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """Angular velocity (3,) [rad/s] in the body's frame, 2 conj(q) dq/dt, of a unit quaternion q."""
     w, x, y, z = quat
     a, b, c, d = rate
-    return 2 * np.array(
-        [w * b - x * a - y * d + z * c, w * c - y * a - z * b + x * d, w * d - z * a - x * c + y * b]
-    )
+    about = w * b - x * a - y * d + z * c, w * c - y * a - z * b + x * d, w * d - z * a - x * c + y * b
+    return 2 * np.array(about)
 
 
 def aligned(log: Recording, out: dict[str, np.ndarray], columns: Mapping[str, str]) -> None:

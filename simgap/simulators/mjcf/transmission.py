@@ -12,6 +12,7 @@ from scipy.signal import savgol_filter
 from simgap.attribution.verdict import ALARM
 from simgap.effect import Parameter
 from simgap.robot_effects.base import RobotEffect
+from simgap.robots.windows import REACH
 from simgap.simulators.mjcf.engine import HINGE, SLIDE, mujoco
 from simgap.simulators.mjcf.model import MjcfSimulator
 from simgap.simulators.mjcf.setting import name_of, object_id
@@ -94,7 +95,7 @@ def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
     return Sizes(rms((m.torque[joint] for m in motions), 1e-9), rate, acceleration, reach)
 
 
-SPAN = 0.06  # chosen: s over which a motion is smoothed by a cubic
+SPAN = 2 * REACH  # chosen: s over which a motion is smoothed by a cubic, as a window's start is
 OFTEN = 100.0  # limit: periods per turn; at 1 rad/s SPAN smooths what comes as often as that away
 
 
@@ -143,8 +144,7 @@ class Motion:
 
 
 def motion_of(simulator: MjcfSimulator, log: Recording) -> Motion:
-    """The motion along a log; what no column shows moves as the model's own run has it, ties and loops
-    closed."""
+    """The motion along a log; what no column shows moves as in the model's own run, loops closed."""
     model, states = simulator.model, simulator.along(log)
     nq, seen = model.nq, {joint: log[column] for column, joint in simulator.joints.items()}
     for joint in np.flatnonzero(np.isin(model.jnt_type, (HINGE, SLIDE))).tolist():
