@@ -76,9 +76,15 @@ class Contacts:
         # An error of the pad's stiffness shifts the face.
         pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
         sd_inward = float(np.hypot(self.sd["inward"], self.sensing.normal.doubt * pressed))
-        sd = self.sd["compression"]
+        sd, place, other = self.sd["compression"], inward - face, self.compression[1 - i]
+        # Both penetrations add up to what the distance falls short of the block's width. While the other
+        # finger alone presses, its force tells its share; a block at rest stops it, a pushed one does not.
+        alone = (other > SURE * sd) & ~(self.compression[i] > SURE * sd)
+        pressing = central_differences(self.signals.t, np.nan_to_num(other))[0]
+        pressing = np.clip(pressing, 0.0, np.maximum(self.inward_rate[:, 1 - i], 0.0))
+        place, rate = np.where(alone, 2 * place - other, place), np.where(alone, 2 * rate - pressing, rate)
         return self._timely(Penetration(
-            self.signals.t, self.compression[i], inward - face, rate, sd, sd,
+            self.signals.t, self.compression[i], place, rate, sd, sd,
             sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
             self.sensing.normal.value + self.sensing.normal.toe.slope < RIGID,
         ), making)  # fmt: skip
