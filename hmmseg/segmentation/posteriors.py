@@ -106,7 +106,7 @@ class Contacts:
             self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
             self.sd["deflection"], self.sd["carried"], sd_y, self.sd["vy"],
             self.sensing.shear.form, self.sensing.shear.value < RIGID,
-        ), making, self.sensing.delay, self.sensing.delay_sd)  # fmt: skip
+        ), making, *self.sensing.shear_delay)  # fmt: skip
 
     def _timely(self, c: Penetration, making: bool, delay: float, sd: float) -> Penetration:
         """Correct a penetration for a small `delay` [s], or lead, of the forces, known to `sd` [s].
