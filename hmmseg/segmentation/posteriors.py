@@ -79,10 +79,12 @@ class Contacts:
         sd, place, other = self.sd["compression"], inward - face, self.compression[1 - i]
         # Both penetrations add up to what the distance falls short of the block's width. While the other
         # finger alone presses, its force tells its share; a block at rest stops it, a pushed one does not.
-        alone = (other > SURE * sd) & ~(self.compression[i] > SURE * sd)
+        alone = making & (other > SURE * sd) & ~(self.compression[i] > SURE * sd)
         pressing = central_differences(self.signals.t, np.nan_to_num(other))[0]
         pressing = np.clip(pressing, 0.0, np.maximum(self.inward_rate[:, 1 - i], 0.0))
         place, rate = np.where(alone, 2 * place - other, place), np.where(alone, 2 * rate - pressing, rate)
+        # What it lacked before is not known by itself, so that its motion begins anew.
+        rate[:, np.append(alone[1:], False) & ~alone] = np.nan
         return self._timely(Penetration(
             self.signals.t, self.compression[i], place, rate, sd, sd,
             sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
