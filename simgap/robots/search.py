@@ -166,7 +166,7 @@ class Search:
         near = (s for s in self.fitted.values() if s.promise > best.score - np.log(RULED_OUT))
         for one in sorted(near, key=lambda one: -one.promise):
             if one.promise > one.score + SETTLED:
-                self.fit(one.names, one.point, [one.whiten])
+                self.fit(one.names, one.point, [one.whiten], -np.inf, one)
         best = self.fitted[frozenset(best.names)]
         leading = max(self.fitted.values(), key=lambda one: one.score)
         return self._with_less(leading) if self._is_better(leading, best) else best
