@@ -42,9 +42,9 @@ from simgap.robots.windows import JUMPS, STRIKES
 EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which sets are scored
 TRIED = 4  # numerics: sets that are fitted exactly about one point
-LEARNED = 2  # numerics: of these, how many teach by how much proposals of replacements are wrong
+LEARNED = 2  # numerics: of these, how many teach by how much promises about that point are wrong
 LEADERS = (16, 4)  # numerics: candidates that are rolled out where they fit best, and that once more
-FIRST_ROLLS = 4  # numerics: how often leading candidates are rolled out where nothing acts yet
+FIRST_LEADERS = (16, 8, 4, 4)  # numerics: the same where nothing acts yet
 NOTHING_NEW = 0.1  # numerics: usual sizes; a candidate is rolled out no nearer to where it was before
 USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet is varied
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
@@ -166,7 +166,7 @@ class Search:
         near = (s for s in self.fitted.values() if s.promise > best.score - np.log(RULED_OUT))
         for one in sorted(near, key=lambda one: -one.promise):
             if one.promise > one.score + SETTLED:
-                self.fit(one.names, one.point, [one.whiten])
+                self.fit(one.names, one.point, [one.whiten], -np.inf, one)
         best = self.fitted[frozenset(best.names)]
         leading = max(self.fitted.values(), key=lambda one: one.score)
         return self._with_less(leading) if self._is_better(leading, best) else best
@@ -228,7 +228,7 @@ class Search:
         Commands held in steps are nearly commands in lines that come later, and no small step leads from one
         to the other: what passes for a delay there hides what acts.
         """
-        ends, columns, promised = [nothing], [], []
+        ends, promised = [nothing], []
         for name in (n for n in self.along if self.composed.effects[n].numeric):
             for short, p in self.composed.effects[name].parameters.items():
                 if self.composed.effects[name].dear or p.nominal not in (p.low, p.high):
@@ -241,14 +241,13 @@ class Search:
                     cov = covariances(composed, linear)
                     end = replace(nothing, composed=composed, point=point, linear=linear, covariances=cov)
                     ends.append(end)
-        for end in ends:
-            self.columns = {}
+        for end in ends:  # candidates act at all ends much as where they were rolled out first
             sets, levels, _ = self._columns_at(end, self.wanted)
             every = [(), *neighbours((), sets.names)]
             promised.append(max(float(sets.scores(every, k).max()) for k in range(len(levels))))
-            columns.append(self.columns)
         best = int(np.argmax(promised))
-        self.columns = columns[best]
+        if best > 0:
+            self.columns.clear()
         return ends[best]
 
     def _from_calibration(self) -> FittedSet | None:
@@ -289,13 +288,16 @@ class Search:
                 from where it puts the starts, as long as the closed form promises more, or is wrong along the
                 starts of a leading set. A fit that stays behind the rival is begun anew with the next scale.
             rival: Log evidence [nats] of the set to beat.
-            near: Another set, at whose starts windows are run in the first fit.
+            near: The set that it was proposed about: windows are run from its starts in the first fit, which
+                goes back towards its point from a beginning that is worse.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
         best, key, starts = None, frozenset(names), {} if near is None else near.linear.starts
         here = (self.composed if near is None else near.composed).moved(begin)
+        known = begin if near is None else {n: near.point[n] for n in begin if n in near.point}
+        nearby = linearise(here, known, [], starts)
         for whiten in scales:
-            point = fit_effects(here, linearise(here, begin, [], starts), whiten, begin)
+            point = fit_effects(here, nearby, whiten, begin)
             one = self._judge(here, names, point)
             for _ in range(AGAIN):
                 leading = max((one, *self.fitted.values()), key=lambda known: known.score)
@@ -382,7 +384,7 @@ class Search:
             self.diverged = tuple(n for n in names if n not in linear.moved)
         base = base_at(composed, at.point)
         # Where the gap is large, one straight line leads only part of the way; it is largest without causes.
-        for count in LEADERS if held else FIRST_ROLLS * LEADERS[:1]:
+        for count in LEADERS if held else FIRST_LEADERS:
             linear = self._roll_out_leaders(composed, base, linear, sets, levels, held, count)
             sets = self._sets(linear, levels, names)
         return sets, levels
@@ -463,15 +465,15 @@ class Search:
         if at is not best:  # straight lines miss as much of a replacement as they miss of the best itself
             of_best = score.max(0)[[{*names} == {*best.names} for names in near]]
             least = min(0.0, *(of_best - own + at.score - best.score)) - NEAR
-        found, order = best, np.argsort(-promised)
+        found, order, learned, wrong = best, np.argsort(-promised), 0, -np.inf
         # Of a large gap lines promise too little of one effect and too much of two: one alone is tried first.
         for part in (order,) if at.names else (order[order < singles], order[order >= singles]):
             if found is not best:
-                least = found.score - best.score + NEAR
-            tried, wrong = 0, 0.0
+                least = max(least, found.score - best.score + NEAR)
+            tried = 0
             for k in part:
                 # Two replacements are fitted to the end whatever lines promise: these may miss by more.
-                learns = at is not best and tried < LEARNED
+                learns = at is not best and learned < LEARNED
                 if tried >= TRIED or (promised[k] < least and not learns):
                     break
                 names = near[k]
@@ -479,15 +481,16 @@ class Search:
                 if frozenset(names) in self.fitted or (at is not best and {*best.names} < {*names}):
                     continue
                 scales = [levels[i] for i in dict.fromkeys((level[k], len(levels) - 1))]
-                one, tried = self.fit(names, begin, scales, -np.inf if learns else best.score), tried + 1
+                one = self.fit(names, begin, scales, -np.inf if learns else best.score, at)
+                tried, learned = tried + 1, learned + 1
                 wrong = max(wrong, one.score - best.score - promised[k])
-                if at is not best and tried == LEARNED:  # other promises are wrong by as much as these were
-                    least = max(least, -NEAR - wrong)
                 if one.score > found.score and self._is_better(one, best):
                     found = one
                     # Others are better proposed about it, if what it leaves is not that of a wrong first.
                     if at is best and one.score > best.score + NEAR and (at.names or not one.discrepancy):
                         break
+                if learned >= LEARNED:  # other promises are wrong by as much as these were
+                    least = max(least, found.score - best.score - NEAR - wrong)
         return None if found is best else found
 
     def predicts_better(self, one: FittedSet, other: FittedSet, by: FittedSet) -> bool:
