@@ -102,8 +102,8 @@ FRESH := experiments/results/gap_fresh.json
 DRAWN := $(BIN)/python -m experiments.gap_drawn --results build/gap_fresh --output $(FRESH)
 gap-fresh: $(INSTALLED)  ## diagnoses of labs of our own second simulator, drawn anew; fills docs/gap_results.md
 	set -e; open() { $(BIN)/python -m experiments.blind_check open --seed $$1 --cases $$2 --out build/$$1 --tiers $$3; }; \
-	  open 272901 20 healthy; open 272911 40 "single pair outside"
-	$(DRAWN) build/272901 build/272911 --run "judged once"
+	  open 273001 20 healthy; open 273011 40 "single pair outside"
+	$(DRAWN) build/273001 build/273011 --run "judged once"
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
