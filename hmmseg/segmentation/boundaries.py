@@ -200,7 +200,7 @@ def log_launch(c: Crossing, h: float, u: np.ndarray) -> np.ndarray:
     return log_after + _log_normal(c.v_left, 0.75 * creep, np.hypot(c.sd_v, 0.25 * creep))
 
 
-ONSET = 0.001  # prior: s; a block that is hit yields to its first pad within sqrt(m / k), half of it seen
+ONSET = 0.001  # prior: s; viscosity lets a pad's force lead its compression, by a few ms in foam
 UNIFORM = 0.02  # prior: weight of a crossing anywhere in the interval, for whatever g leaves out
 
 

@@ -51,7 +51,7 @@ class Penetration:
     `pressed` [m]: from the force; `place` [m]: from the position; `rate` (2, num_samples) [m/s] of `place`,
     just before and just after each sample. `sd_pressed`: noise of the force; `form`: relative deviation of a
     pad's force from its law; `sd_apart` [m]: force readings without contact. `hidden`: a rigid pad, whose
-    force shows that there is contact, but not how deep it is. `delay_sd` [s]: of a pad's viscosity.
+    force shows that there is contact, but not how deep it is.
     """
 
     t: np.ndarray
@@ -64,13 +64,6 @@ class Penetration:
     sd_rate: float
     form: float
     hidden: bool = False
-    delay_sd: float = 0.0
-
-    @property
-    def sd_force(self) -> np.ndarray:
-        """Error (num_samples,) [m] of `pressed`: noise, the pad's law, and its motion during `delay_sd`."""
-        pressed, pace = np.nan_to_num(self.pressed), np.nan_to_num(self.rate).mean(axis=0)
-        return np.sqrt(self.sd_pressed**2 + (self.form * pressed) ** 2 + (pace * self.delay_sd) ** 2)
 
     def restless(self, n: int) -> float:
         """Variance a second [m^2/s^3] by which the rate wandered up to sample n; NaN if that is not seen."""
@@ -94,7 +87,7 @@ def log_contact(c: Penetration, making: bool) -> tuple[np.ndarray, np.ndarray]:
     silent = np.where(force, log_student(pressed, c.sd_apart), 0.0)
     within = np.where(position, log_ndtr(place / c.sd_place), 0.0) - log_place
     beyond = np.where(position, log_ndtr(-place / c.sd_place), 0.0) - log_place
-    sd_force = c.sd_force
+    sd_force = np.hypot(c.sd_pressed, c.form * np.abs(pressed))
     both = np.hypot(sd_force, c.sd_place)
     depth = (c.sd_place**2 * pressed + sd_force**2 * place) / both**2
     agree = log_student(pressed - place, both) - log_place
@@ -159,7 +152,7 @@ class Prior:
 class Change:
     """Contacts made or broken at one boundary: the last of two made, or the first of two broken, decides.
 
-    `timing` [s]: uncertainty of the sensor's clock. `slips` [m]: deepest penetration at which each broken
+    `timing` [s]: uncertainty of the forces' clock. `slips` [m]: deepest penetration at which each broken
     contact may slide.
     """
 
@@ -315,7 +308,7 @@ def _crossing(c: Penetration, n: int, change: Change) -> Crossing:
     making, kind = change.making, change.kind
     touching, apart = (n + 1, n) if making else (n, n + 1)
     pressed, gap = c.pressed[touching], c.place[apart]
-    sd_pressed = float(c.sd_force[touching])
+    sd_pressed = float(np.hypot(c.sd_pressed, c.form * abs(pressed)))
     if c.hidden:
         pressed = max(c.place[touching], 0.0)
         sd_pressed = c.sd_place + 0.5 * abs(gap)

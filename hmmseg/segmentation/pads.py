@@ -39,7 +39,6 @@ from hmmseg.segmentation.emissions import Parameters, channel_sd
 from hmmseg.segmentation.stretches import (
     DEPENDENT,
     NONE,
-    ROUNDS,
     Stretch,
     Toe,
     find_toe,
@@ -53,7 +52,7 @@ from hmmseg.segmentation.stretches import (
 )
 
 STEP = 0.0025  # numerics: s; step at which distances and filters are evaluated
-FINE = np.arange(-0.015, 0.0101, 0.001)  # numerics: s; delays of any hand: foams lead by some ms
+FINE = np.arange(-0.01, 0.0101, 0.001)  # numerics: s; delays of any hand: foams lead by some ms
 SHIFTS = np.arange(0.015, 0.301, 0.005)  # prior: s; delays of a sensor, equally likely
 CONSTANTS = np.array([0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1])  # prior: s; of its filter, alike
 LEAD_SD = 0.003  # prior: s; of a delay that is not the sensor's: foams lead by a few ms at most
@@ -114,7 +113,7 @@ class Lateness:
     compliance: tuple[float, float] = (0.0, SOFT)
 
 
-def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], toe: Toe = NONE) -> Lateness:
+def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float]) -> Lateness:
     """Delay of the forces; the sensor's if a long delay, or a filter, is decisively the better explanation.
 
     `prior`: mean and sd of the compliance of a pad [m/N], which is profiled.
@@ -131,9 +130,9 @@ def lateness(squeezes: Sequence[Squeeze], prior: tuple[float, float], toe: Toe =
         """Log-likelihoods (C, len(values)) of compliances and shifts, or time constants of a filter [s]."""
         total = -(((compliances - prior[0]) / prior[1]) ** 2)[:, None] / 2
         for s, white in zip(squeezes, noises, strict=True):
-            load, pace = _late(s.t, _loads(s, compliances, toe), values, filtered)
+            load, pace = _late(s.t, _loads(s, compliances), values, filtered)
             left = np.mean(_late(s.t, white, values, filtered) ** 2, axis=(0, 1))
-            total = total + _log_likelihood(s, compliances, toe, load, pace, left)
+            total = total + _log_likelihood(s, compliances, load, pace, left)
         return total
 
     compliances = prior[0] * COMPLIANCES if prior[0] > 0 else UNSTATED
@@ -160,17 +159,13 @@ def _moments(values: np.ndarray, log_weight: np.ndarray) -> tuple[float, float]:
     return mean, float(np.sqrt(weight @ (values - mean) ** 2 + np.min(np.diff(values)) ** 2 / 12))
 
 
-def _loads(s: Squeeze, compliances: np.ndarray, toe: Toe) -> np.ndarray:
+def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
     """Loads [N] and absolute rates, (2, num_compliances, num_steps), at each STEP from the first sample."""
     load = np.nan_to_num(s.load)
     holds = load >= HOLD * np.quantile(load, FIRMEST)
-    held = s.distance[holds] + toe.give(load[holds])
-    width = np.median(held + compliances[:, None] * load[holds], axis=1, keepdims=True)
-    pressed = np.maximum(width - _joined(s.t, s.distance, s.rate), 0.0)
-    load = pressed / compliances[:, None]
-    for _ in range(ROUNDS if toe is not NONE else 0):  # Newton's: from below, on a concave curve
-        steep = compliances[:, None] + toe.slope * np.exp(-load / toe.soft)
-        load = np.maximum(load - (compliances[:, None] * load + toe.give(load) - pressed) / steep, 0.0)
+    width = np.median(s.distance[holds] + compliances[:, None] * load[holds], axis=1, keepdims=True)
+    distance = _joined(s.t, s.distance, s.rate)
+    load = np.maximum(width - distance, 0.0) / compliances[:, None]
     return np.stack([load, np.abs(np.gradient(load, STEP, axis=1))])
 
 
@@ -209,7 +204,7 @@ def _steps(clock: np.ndarray, num_steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _log_likelihood(
-    s: Squeeze, compliances: np.ndarray, toe: Toe, load: np.ndarray, pace: np.ndarray, left: np.ndarray
+    s: Squeeze, compliances: np.ndarray, load: np.ndarray, pace: np.ndarray, left: np.ndarray
 ) -> np.ndarray:
     """Log-likelihoods (C, M) of one squeeze, given loads and rates (C, N, M); Student-t.
 
@@ -220,8 +215,7 @@ def _log_likelihood(
     """
     there = np.isfinite(s.load)
     force, load, pace = s.load[there][:, None], load[:, there], pace[:, there]
-    steep = compliances[:, None, None] + toe.slope * np.exp(-load / toe.soft)
-    noise = (s.sd_distance / steep) ** 2 * (load > s.sd_load)
+    noise = (s.sd_distance / compliances[:, None, None]) ** 2 * (load > s.sd_load)
     known = s.sd_load**2 + (LAW_SHARE * load) ** 2 + (LAW_LEAD * pace) ** 2
     apart = (force - load) ** 2 / (known + left * noise)
     total = ((TAIL + 1) * np.log1p(apart / TAIL) + np.log(known + noise)).sum(axis=1)
@@ -274,11 +268,6 @@ class Sensing:
     friction: float = np.inf
     rests: np.ndarray = field(default_factory=lambda: np.zeros(0))
     noise: tuple[float, float] = (SLOWEST_SD, 0.0)
-
-    @property
-    def shear_delay(self) -> tuple[float, float]:
-        """Delay of the vertical forces and its sd [s]: that of all, but for a rounded tip's own viscosity."""
-        return (self.delay, self.delay_sd) if self.normal.toe is NONE else (0.0, LEAD_SD)
 
     @property
     def pads(self) -> Pads:
@@ -386,19 +375,15 @@ def sense(
     priors = [_prior(nominal.normal1, max(rig.systematic.pad_stiffness)),
               _prior(nominal.shear1, max(rig.systematic.pad_stiffness))]  # fmt: skip
     timing, toe = lateness(felt, priors[0]), NONE
-    lead = upright = (0.0 if timing.late else timing.delay, timing.sd)  # along the grip, and vertically
+    lead, unknown = 0.0 if timing.late else timing.delay, timing.sd
     if not again:  # corrected forces, or a wrist's, are too coarse for a toe
-        toe = find_toe([(*reading(s, lead[0])[:2], s.sd) for s in grips])
-        if toe is not NONE:  # it explains part of an apparent lead: a touch and a release tell them apart
-            grips, lead = [replace(s, toe=toe) for s in grips], (0.0, timing.sd)
-            if not timing.late:
-                static = _compliance([_while_moving(s, *lead) for s in grips], priors[0], float(rung[0]))
-                anew = lateness(felt, (static.value, static.sd), toe)
-                timing = Lateness() if anew.late else anew
-                lead, upright = (timing.delay, timing.sd), (0.0, LEAD_SD)
+        toe = find_toe([(*reading(s, lead)[:2], s.sd) for s in grips])
+        if toe is not NONE:  # a toe explains an apparent delay
+            grips, lead = [replace(s, toe=toe) for s in grips], 0.0
+            timing = timing if timing.late else Lateness()
     normal, shear = (
-        _compliance([_while_moving(s, *delay) for s in own], prior, float(r))
-        for own, delay, prior, r in zip((grips, loads), (lead, upright), priors, rung[:2], strict=True)
+        _compliance([_while_moving(s, lead, unknown) for s in own], prior, float(r))
+        for own, prior, r in zip((grips, loads), priors, rung[:2], strict=True)
     )
     # Late loads of a stretch are not those of its places.
     normal = Compliance(*timing.compliance, FORM) if timing.late else replace(normal, toe=toe)
@@ -406,9 +391,7 @@ def sense(
     doubt = float(np.sqrt(timing.sd**2 + (LATE_SHARE * timing.delay * timing.late) ** 2 + between**2))
     friction = float(np.quantile(ratios, LARGEST)) if ratios else np.inf
     heights = [
-        place + shear.value * load
-        for load, place, _ in (reading(s, upright[0]) for s in loads)
-        if load.size > 3
+        place + shear.value * load for load, place, _ in (reading(s, lead) for s in loads) if load.size > 3
     ]
     rests = np.concatenate([np.zeros(0), *(height - np.median(height) for height in heights)])
     noise = (float(np.median([own.sd for own in loads] or [SLOWEST_SD])),

@@ -54,7 +54,7 @@ class Contacts:
         stretch = (self.signals.t >= held[0]) & (self.signals.t <= held[1])
         if not stretch.any():
             return None
-        timing = self.sensing.delay_sd if self.sensing.late else 0.0
+        timing = self.sensing.delay_sd
         if FREE in (before.state, after.state):
             making = before.state == FREE
             fingers = tuple(self._finger(i, stretch, making) for i in (0, 1))
@@ -76,20 +76,12 @@ class Contacts:
         # An error of the pad's stiffness shifts the face.
         pressed = np.nan_to_num(median_of_known(self.compression[i, held]))
         sd_inward = float(np.hypot(self.sd["inward"], self.sensing.normal.doubt * pressed))
-        sd, place, other = self.sd["compression"], inward - face, self.compression[1 - i]
-        # Both penetrations add up to what the distance falls short of the block's width. While the other
-        # finger alone presses, its force tells its share; a block at rest stops it, a pushed one does not.
-        alone = making & (other > SURE * sd) & ~(self.compression[i] > SURE * sd)
-        pressing = central_differences(self.signals.t, np.nan_to_num(other))[0]
-        pressing = np.clip(pressing, 0.0, np.maximum(self.inward_rate[:, 1 - i], 0.0))
-        place, rate = np.where(alone, 2 * place - other, place), np.where(alone, 2 * rate - pressing, rate)
-        # What it lacked before is not known by itself, so that its motion begins anew.
-        rate[:, np.append(alone[1:], False) & ~alone] = np.nan
+        sd = self.sd["compression"]
         return self._timely(Penetration(
-            self.signals.t, self.compression[i], place, rate, sd, sd,
+            self.signals.t, self.compression[i], inward - face, rate, sd, sd,
             sd_inward, self.sd["inward_rate"], self.sensing.normal.form,
             self.sensing.normal.value + self.sensing.normal.toe.slope < RIGID,
-        ), making, self.sensing.delay, self.sensing.delay_sd)  # fmt: skip
+        ), making)  # fmt: skip
 
     def _slip(self, i: int, held: np.ndarray) -> float:
         """Compression [m] at which finger i slides off a block that it has `held`, as friction is spent."""
@@ -108,22 +100,21 @@ class Contacts:
             self.signals.t, carrying - self.deflection, level + carrying - y, self.sinking,
             self.sd["deflection"], self.sd["carried"], sd_y, self.sd["vy"],
             self.sensing.shear.form, self.sensing.shear.value < RIGID,
-        ), making, *self.sensing.shear_delay)  # fmt: skip
+        ), making)  # fmt: skip
 
-    def _timely(self, c: Penetration, making: bool, delay: float, sd: float) -> Penetration:
-        """Correct a penetration for a small `delay` [s], or lead, of the forces, known to `sd` [s].
+    def _timely(self, c: Penetration, making: bool) -> Penetration:
+        """Correct a penetration for a small delay, or lead, of the forces.
 
         A touch begins with the compression, and with a late sensor so does a release. Foam that leads by its
         viscosity releases where its force is spent, as it recovers more slowly. A stiff pad moves with its
         finger, so only its force shows how fast it is pressed.
         """
         rate = central_differences(c.t, c.pressed)[0] if c.hidden else c.rate.mean(axis=0)
-        c = c if self.sensing.late else replace(c, delay_sd=sd)
-        moved = delay * np.nan_to_num(rate)
-        if not making and delay < 0:
+        moved = self.sensing.delay * np.nan_to_num(rate)
+        if not making and self.sensing.delay < 0:
             return replace(c, place=c.place - moved)
         # Where the gap exceeds the motion within a reading there is no compression: the force is ringing.
-        meanwhile = np.abs(c.rate.mean(axis=0)) * (WINDOW + abs(delay))
+        meanwhile = np.abs(c.rate.mean(axis=0)) * (WINDOW + abs(self.sensing.delay))
         sure = (c.pressed > SURE * c.sd_apart) & ~(c.place < -SURE * c.sd_place - meanwhile)
         return replace(c, pressed=np.where(sure, np.maximum(c.pressed + moved, 0.0), c.pressed))
 

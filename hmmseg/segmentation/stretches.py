@@ -84,7 +84,6 @@ def find_toe(readings: Sequence[Reading]) -> Toe:
     load[there], value[there] = (np.concatenate([r[i] for r in readings]) for i in range(2))
     straight = _depths(load, value, np.zeros((1, *load.shape)), there, usual)[1]
     scale = max(usual, robust_sd(straight[0][there]))
-    straight = _depths(load, value, np.zeros((1, *load.shape)), there, scale)[1]
     toes = np.stack([Toe(1.0, soft).give(load) for soft in SOFTS])
     depth, residual, precision = _depths(load, value, toes, there, scale)
     gain = _evidence(residual, there, scale) - _evidence(straight, there, scale) - (depth / DEPTH) ** 2 / 2

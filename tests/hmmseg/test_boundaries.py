@@ -353,21 +353,3 @@ def test_the_load_on_a_stiff_pad_is_not_moved_by_noise_of_its_finger():
     load = table._load(aligned.subtasks[1], np.ones(n, bool), making=False)
     np.testing.assert_allclose(load.pressed, load.pressed[0], rtol=1e-9)
     assert load.hidden and load.pressed[0] > 0
-
-
-def test_the_depth_of_a_finger_that_presses_tells_what_the_other_lacks():
-    folder = example_folder()
-    rig = Rig.read(folder / "rig.toml")
-    signals = task_space(Trial.read(folder / "trial_01.csv", rig), rig)
-    t, zero = signals.t, 0 * signals.t
-    one, two = (np.minimum(0.02 * (t - touch), 4e-4) for touch in (2.0, 2.1))
-    fx1, fx2 = np.maximum(one, 0) / 2.5e-4, -np.maximum(two, 0) / 2.5e-4
-    soft = Compliance(2.5e-4, 1e-6, 0.0)
-    seen = replace(signals, x1=one, x2=0.03 - two, fx1=fx1, fx2=fx2, fy1=zero, fy2=zero)
-    parameters = replace(
-        align(folder / "trial_01.csv", folder / "task.toml", rig).fit.parameters, bias=np.zeros(4)
-    )
-    second = contacts(seen, Sensing(soft, soft, 0.0, 0.0), parameters)._finger(1, t > 2.5, making=True)
-    alone = (one > 1e-4) & (two < 0)
-    np.testing.assert_allclose(second.place[alone], two[alone], atol=1e-9)
-    assert alone.any() and np.all(second.place[t < 1.9] < -1e-4)
