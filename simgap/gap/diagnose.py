@@ -322,7 +322,7 @@ def diagnose(
     tell("attributing the gap")
 
     null = () if healthy is None else healthy_statistics(found, healthy, actual)
-    gap, verdict = attributed(found, forced, seed, null)
+    gap, verdict = attributed(found, forced, seed, null, tell)
     named = (gap.candidates[verdict.effects[name].candidate] for name in verdict.causes)
     shifting = [c for c in named if _shifts_signals(c)]
     causes = _together(found, shifting) if shifting else found.healthy
@@ -358,6 +358,7 @@ def attributed(
     forced: tuple[str, ...] = (),
     seed: int = 0,
     healthy: Iterable[float] = (),
+    tell: Progress = silent,
 ) -> tuple[Gap, Attribution]:
     """Attribute the gap of a search, with effects that act together linearised where they do.
 
@@ -366,16 +367,17 @@ def attributed(
         forced: Effects that are imposed instead of chosen.
         seed: Of the draws behind intervals.
         healthy: Statistics of healthy recordings, drawn if there is an alarm.
+        tell: Called with a description of each stage.
     """
     gap, searched = found.gap, None
     if not forced:
         f = forms(gap)
         searched = f, sought(f)
-        joint = [one for one in (_leading(found, f, searched[1][0]), _paired(found, *searched)) if one]
+        both = _leading(found, f, searched[1][0]), _paired(found, *searched, tell)
+        joint = sorted((one for one in both if one is not None), key=lambda one: one.cost)
         if joint:
-            best = min(joint, key=lambda one: one.cost)
-            left = scatters(found.problem, best.residual, [s.effect for s in found.scatters])
-            for one in joint:
+            left = scatters(found.problem, joint[0].residual, [s.effect for s in found.scatters])
+            for one in {frozenset(one.effects): one for one in reversed(joint)}.values():
                 gap = together(found.problem, gap, found.healthy, one, left, found.redrawn)
             searched = None
     absorbed = properties_tolerated(found.problem)
@@ -403,19 +405,20 @@ def _leading(found: Search, f: Forms, best: Model) -> Fitted | None:
     return min(both, key=lambda one: one.cost)
 
 
-def _paired(found: Search, f: Forms, models: list[Model]) -> Fitted | None:
+def _paired(found: Search, f: Forms, models: list[Model], tell: Progress = silent) -> Fitted | None:
     """Fit the likeliest single cause with each other one, if the best set leaves more than noise.
 
     By itself an effect is fitted, and linearised, where the other cause still acts on it; the best pair
-    counts.
+    counts. None if there is no second effect.
     """
-    if detected(statistic(f, models, models[0].effects)).p_value >= ALARM:
-        return None
     every = [j for j, c in enumerate(f.gap.candidates) if _shifts_signals(c)]
+    if not every or detected(statistic(f, models, models[0].effects)).p_value >= ALARM:
+        return None
+    tell("seeking a second cause")
     first = _together(found, [f.gap.candidates[max(every, key=lambda j: fitted(f, (j,)).score)]])
     name = name_of(first.effects[0])
     keys = [key for one in found.fits for key in one.effects if name_of(key) != name]
-    return min((best_fit(found.problem, key, first) for key in keys), key=lambda one: one.cost)
+    return min((best_fit(found.problem, key, first) for key in keys), key=lambda one: one.cost, default=None)
 
 
 def _together(found: Search, which: Sequence[Candidate], start: np.ndarray | None = None) -> Fitted:

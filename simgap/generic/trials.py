@@ -34,7 +34,7 @@ EVENT = 0.5  # chosen: s; that time, or a quarter of the shortest trial's subtas
 SUB_BANDS = 8  # chosen: sub-bands of fast power, evenly spaced in log frequency
 LOWEST = 6  # chosen: half periods per window at which fast power begins
 FEWEST = 3  # chosen: fewest DCT coefficients of a sub-band, and of a window's fast power
-FLOOR = 1e-4  # numerics: rms over a channel's scale that keeps logs of power finite; its tenth does too
+FLOOR = 1e-4  # numerics: rms over a channel's scale; keeps logarithms of power finite
 SLOW, FAST, DURATION = range(3)
 TASK_SPACE = ("x", "y", "distance", "offset", "vx", "vy", "fx", "fy", "grip", "shear")
 

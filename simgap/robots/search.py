@@ -42,7 +42,7 @@ from simgap.robots.windows import JUMPS, STRIKES
 EXPECTED = 1.0  # prior: how many of all candidates act
 LEVELS = (1.0, 0.3, 0.1, 0.03)  # numerics: shares of the discrepancy with which sets are scored
 TRIED = 4  # numerics: sets that are fitted exactly about one point
-LEARNED = 2  # numerics: of these, how many teach by how much promises about that point are wrong
+LEARNED = 2  # numerics: of these, how many show by how much straight lines promise too much
 LEADERS = (16, 4)  # numerics: candidates that are rolled out where they fit best, and that once more
 FIRST_LEADERS = (16, 8, 4, 4)  # numerics: the same where nothing acts yet
 NOTHING_NEW = 0.1  # numerics: usual sizes; a candidate is rolled out no nearer to where it was before

@@ -128,6 +128,7 @@ def test_a_second_cause_is_sought_next_to_the_likeliest_one(healthy, monkeypatch
     assert paired(keys) is None  # both, each as by itself, leave nothing
     monkeypatch.setattr(diagnose, "ALARM", 2.0)
     assert {*paired(keys).effects} == {"force_crosstalk", "joint_offset"}
+    assert paired(keys[:1]) is None and paired(()) is None  # no second effect, none at all
 
 
 def test_a_fit_converges_although_derivatives_from_before_the_effect_are_off():
