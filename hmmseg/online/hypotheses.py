@@ -26,9 +26,13 @@ from hmmseg.online.hypothesis import (
     learn,
     lifted,
     log_sum,
+    lowered,
+    opened,
+    sliding_out,
     supported,
 )
 from hmmseg.segmentation.conformity import BRIEF, DEPARTURE, STAGES
+from hmmseg.segmentation.emissions import MAX_RATE
 from hmmseg.segmentation.free_contacts import RINGING
 
 LOG_DEPARTURE = math.log(DEPARTURE)
@@ -62,9 +66,13 @@ class Chain(NamedTuple):
 
 @compiled
 def _settled(age: float) -> float:
-    """Probability that a contact has settled: Erlang, STAGES stages, SETTLING s on average."""
-    z = age * STAGES / SETTLING
-    return -math.expm1(-z) - math.exp(-z) * (z + z * z / 2)
+    """Probability that a contact has settled: STAGES stages, each of a sample at MAX_RATE or more.
+
+    SETTLING s on average, as off line: where a block is `placed` for less it falls as the fingers open.
+    """
+    n, p = math.floor(age * MAX_RATE + 1e-9), STAGES / (SETTLING * MAX_RATE)
+    q = 1.0 - p
+    return 1.0 - q ** (n - 2) * (q * q + n * p * q + n * (n - 1) * p * p / 2) if n >= STAGES else 0.0
 
 
 @compiled
@@ -105,7 +113,10 @@ def absorb(into: Table, i: int, other: Table, j: int) -> None:
         _mix(h.ring[k], g.ring[k], a, b)
     _average(h.bias, g.bias, a, b)
     _average(h.scale, g.scale, a, b)
-    h.level[0], h.level[1] = a * h.level[0] + b * g.level[0], a * h.level[1] + b * g.level[1]
+    for k in range(2):
+        h.level[k] = a * h.level[k] + b * g.level[k]
+        h.apart[k] = a * h.apart[k] + b * g.apart[k]
+        h.firm[k] = a * h.firm[k] + b * g.firm[k]
     _average(into.known[i], other.known[j], a, b)
     h.weight = total
 
@@ -119,6 +130,8 @@ def _enter(
     h.state = after
     h.entered[0], h.entered[1] = t - half, half * half / 3
     wrong = False
+    if kinds[before] == FREE_KIND:
+        h.apart[:], h.firm[:] = 0.0, 0.0
     placed = h.level[1] > 0.0
     if kinds[before] == GROUND_KIND and kinds[after] != FREE_KIND and placed:
         h.origin[0], h.origin[1] = h.level[0] / h.level[1], 1.0 / h.level[1]
@@ -156,8 +169,14 @@ def _add(table: Table, count: int, fresh: Table, j: int) -> int:
 
 
 @compiled
-def _advance(table: Table, count: int, fresh: Table, t: float, dt: float, chain: Chain) -> int:
-    """Let hypotheses move on to the task's next state, in part."""
+def _advance(
+    table: Table, count: int, fresh: Table, x: Record, dt: float, chain: Chain, span: Record, pads: Pads
+) -> int:
+    """Let hypotheses move on to the task's next state, in part.
+
+    Within the task, a block is lowered and fingers open to release it; one that departs may lose it.
+    """
+    t, kinds = x.t, chain.kinds
     num_new, half, away = 0, dt / 2, -math.expm1(-dt / PACE)
     for i in range(count):
         state = table.rows[i].state
@@ -168,12 +187,17 @@ def _advance(table: Table, count: int, fresh: Table, t: float, dt: float, chain:
         _copy(fresh, num_new, table, i)
         h = fresh.rows[num_new]
         h.weight += math.log(away) + math.log(BRIEF + settled)
+        after = 1 if off else state + 1
+        if kinds[after] == FREE_KIND:
+            h.weight += opened(h, fresh.known[num_new], chain.blocks[state], x)
+        elif kinds[state] == ABOVE_KIND:
+            h.weight += lowered(h, x, span, pads)
         if off:
             h.round += 1
         at = h.crossed % NUM_RING  # one more boundary of the task, right before t
         h.ring[at, 0], h.ring[at, 1] = t - half, half * half / 3
         h.crossed += 1
-        if _enter(h, fresh.known[num_new], t, half, chain, state, 1 if off else state + 1):
+        if _enter(h, fresh.known[num_new], t, half, chain, state, after):
             # another block, or another place: a departure
             h.state, h.missed, h.left_at = chain.num_steps, state, t
         num_new = _add(fresh, num_new, fresh, num_new)
@@ -264,9 +288,13 @@ def _explained(
 ) -> float:
     """Log-likelihood of a reading in the hypothesis's own state, ringing while the contact settles."""
     kind, block = chain.kinds[h.state], chain.blocks[h.state]
-    if kind == FREE_KIND:
-        return free(h, x, span)
     settled = _settled(x.t - h.entered[0])
+    if kind == FREE_KIND:
+        own, lost = free(h, x, span), h.missed > 0 and h.state == chain.num_steps
+        if lost and chain.kinds[h.missed - 1] == ABOVE_KIND and settled < 1.0:
+            other = sliding_out(h, known, chain.blocks[h.missed], x, span, pads)
+            own = log_sum(own, math.log1p(-settled) + other)
+        return own
     if kind == ABOVE_KIND:
         own = lifted(h, known, block, x, span, gravity, settled)
     else:
@@ -300,7 +328,7 @@ def advance(
     chain = Chain(states[:, 0], states[:, 1], states[:, 2], signs, num_steps, num_blocks, num_rounds)
     pads = Pads(compliances[0], compliances[1], compliances[2], compliances[3])
     if dt > 0.0:
-        count = _advance(table, count, fresh, x.t, dt, chain)
+        count = _advance(table, count, fresh, x, dt, chain, span, pads)
     if since > 0.0:
         count = _depart(table, count, fresh, x.t, since, chain)
     top = -math.inf

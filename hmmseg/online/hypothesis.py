@@ -28,6 +28,7 @@ from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.levels import MOVED, SURE, TAIL
 from hmmseg.online.compiled import compiled
 from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, STRAY, TOUCHING, WINDOW
+from hmmseg.segmentation.free_contacts import CLOSED
 
 NUM_RING = 8  # numerics: most recent boundaries remembered; a move has four
 # numerics: order of the residuals' scales, named as in hmmseg.segmentation.emissions
@@ -43,7 +44,9 @@ HYPOTHESIS = np.dtype([
     ("missed", "i8"), ("left_at", "f8"),  # after a departure: missing subtask (-1: none), since when [s]
     ("entered", "f8", 2), ("origin", "f8", 2),  # mean and variance: time of entry [s], level at pickup [m]
     ("ring", "f8", (NUM_RING, 2)),  # mean and variance of the last boundaries [s]
-    ("bias", "f8", (4, 2)), ("scale", "f8", (7, 2)), ("level", "f8", 2),  # evidence; level: of the support
+    ("bias", "f8", (4, 2)), ("scale", "f8", (7, 2)), # evidence; level: of the support, or highest one carried
+    ("level", "f8", 2),
+    ("apart", "f8", 2), ("firm", "f8", 2),  # sum, weight: distance [m] of a grip; its force [N] while carried
 ])  # fmt: skip
 READING = np.dtype([
     ("t", "f8"), ("force", "f8", 4), ("vx", "f8"), ("vy", "f8"), ("ay", "f8"), ("y", "f8"), ("d", "f8"),
@@ -379,6 +382,56 @@ def supported(
     return log_sum(_LOG_REST + still + resting, force + _LOG_STRAY + aside + log_sum(upward, broad))
 
 
+# What tells a block that is set down and released from one that falls, as off line
+# (`hmmseg.segmentation.free_contacts`).
+
+
+@compiled
+def lowered(h: Record, x: Record, span: Record, pads: Pads) -> float:
+    """Log-likelihood ratio, to any height, of the height at which a carried block meets its support.
+
+    It has come down, unless it stays where it was carried.
+    """
+    height = _held_height(h, x, pads)
+    if math.isnan(height) or h.level[1] <= 0.0:
+        return 0.0
+    spread = x.sd_y * x.sd_y + _square(h, LEVEL) + 1.0 / h.level[1]
+    aloft = _LOG_STILL + math.log(span.y) + log_student(height - h.level[0] / h.level[1], math.sqrt(spread))
+    return -log_sum(_LOG_MOVING, aloft)
+
+
+@compiled
+def opened(h: Record, known: np.ndarray, block: int, x: Record) -> float:
+    """Log-likelihood ratio, to any distance, of that of fingers that release a block which stays in place.
+
+    Pads relax before they leave it: the fingers are farther apart than while holding, by at least half of
+    what the pads gave.
+    """
+    width = known[2 * block + 1]
+    if math.isnan(x.d) or h.apart[1] <= 0.0 or width[1] <= 0.0:
+        return 0.0
+    least = (h.apart[0] / h.apart[1] + width[0] / width[1]) / 2
+    beyond = (x.d - least) / math.sqrt(x.sd_d * x.sd_d + _square(h, WIDTH))
+    return math.log((1.0 - CLOSED) * math.erfc(-beyond / math.sqrt(2.0)) / 2 + CLOSED)
+
+
+@compiled
+def sliding_out(h: Record, known: np.ndarray, block: int, x: Record, span: Record, pads: Pads) -> float:
+    """Log-likelihood of a reading while a block slides out of opening fingers in the air.
+
+    It loads them more, for their grip, than while carried; a support takes the load before the grip goes.
+    """
+    of_weight = known[2 * block]
+    if h.firm[1] <= 0.0 or of_weight[1] <= 0.0:
+        return -math.inf
+    load, grip = abs(_force(h, x, 1) + _force(h, x, 3)), (_force(h, x, 0) - _force(h, x, 2)) / 2
+    weight, noise = of_weight[0] / of_weight[1], math.sqrt(2 * _square(h, FORCE))
+    if not h.firm[0] / h.firm[1] * (load - SURE * noise) > weight * grip:
+        return -math.inf
+    out = log_between(load, 0.0, weight, math.sqrt(_carry(h, x)))
+    return out + _moves(h, x, span, STILL, 0.0) + held(h, known, block, x, span, pads)
+
+
 MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
 MOST_SCALE = 200.0  # chosen: readings that a scale remembers
 LEAST = 1e-12  # numerics: N^2, m^2; least squared scale
@@ -432,6 +485,8 @@ def learn(
             _learn_mean(h.bias[c], x.force[c], noise, share, MOST_BIAS)
             _learn_scale(h.scale[FORCE], residual, share / 4, LEAST)
         return
+    if not math.isnan(x.d):
+        h.apart[0], h.apart[1] = h.apart[0] + share * x.d, h.apart[1] + share
     fy1, fy2 = _force(h, x, 1), _force(h, x, 3)
     _learn_scale(h.scale[NET_X], _force(h, x, 0) + _force(h, x, 2), share, noise)
     _learn_scale(h.scale[SHEAR], (fy1 - fy2) / 2, share, noise)
@@ -440,6 +495,16 @@ def learn(
         _learn_scale(h.scale[WIDTH], measured - width[0] / width[1], share, FLOOR * x.sd_d**2)
     _learn_mean(width, measured, x.sd_d * x.sd_d + _square(h, WIDTH), share, math.inf)
     if kind == ABOVE_KIND:
+        grip = (_force(h, x, 0) - _force(h, x, 2)) / 2
+        if not math.isnan(grip):
+            h.firm[0], h.firm[1] = h.firm[0] + share * grip, h.firm[1] + share
+        height = _held_height(h, x, pads)
+        spread = x.sd_y * x.sd_y + _square(h, LEVEL)
+        rise = height - h.level[0] / h.level[1] if h.level[1] > 0.0 else math.inf
+        if rise > SURE * math.sqrt(spread):
+            h.level[:] = 0.0
+        if rise > -SURE * math.sqrt(spread):
+            _learn_mean(h.level, height, spread, share, math.inf)
         factor = 1.0 if math.isnan(x.ay) else inertia_factor(x.ay, gravity)
         if weight[1] > 0.0:
             _learn_scale(h.scale[CARRY], fy1 + fy2 - factor * weight[0] / weight[1], share, noise)

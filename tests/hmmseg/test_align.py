@@ -14,7 +14,6 @@ from misfit_edits import EDITS, FORCES, RIG, TRIALS, TRUTH, join, let_go
 from refusals import refused
 from typer.testing import CliRunner
 
-import hmmseg
 from experiments.recordings import read_case
 from experiments.worlds import WORLDS, Cell, World, replicates, scene, simulated_cases, trials_of
 from hmmseg import example_folder
@@ -25,6 +24,7 @@ from hmmseg.hand.signals import task_space
 from hmmseg.io.rig import FORCE_CHANNELS, Fingertip, Noise, Rig
 from hmmseg.io.task import BlockTask, Move, Task
 from hmmseg.io.trial import Trial
+from hmmseg.online.watcher import Watcher
 from hmmseg.segmentation.align import align, segment, segment_long
 from hmmseg.segmentation.conformity import examine
 from hmmseg.segmentation.emissions import features, thin
@@ -263,6 +263,17 @@ def test_a_block_that_falls_while_it_halts_in_the_air_was_not_put_down(case, whi
     (verdict,) = examine([features(thin(task_space(fallen, found.rig)), found.rig)], [found.task])
     assert verdict.failing == expected
     assert verdict.log_odds > 5  # without a look at the fingers' distance -0.3
+    assert not watched(fallen, found.task, found.rig)
+
+
+def watched(trial, task, rig) -> bool:
+    """Whether a trial fits its task to the end, followed while it runs."""
+    watcher = Watcher(task, rig)
+    missing = np.full(trial.t.size, np.nan)
+    rows = np.stack([trial.channels.get(name, missing) for name in watcher.channels], axis=1)
+    for t, row in zip(trial.t, rows, strict=True):
+        watcher.update(float(t), row)
+    return watcher.finish().fits
 
 
 def carried(rate: float, falls: bool) -> pd.DataFrame:
@@ -290,8 +301,10 @@ def test_a_block_that_slides_out_of_opening_fingers_was_not_put_down(rate):
     """Where it halts in the air it may pass for a block on a support as well."""
     rig = {"fingertip": {"normal_stiffness": 3000.0, "shear_stiffness": 2000.0},
            "noise": {"position": 2e-5, "force": 0.01}}  # fmt: skip
-    healthy, fallen = (hmmseg.segment([carried(rate, falls)], ONE_BLOCK, rig)[0] for falls in (False, True))
+    trials = [Trial.read(carried(rate, falls), Rig.read(rig)) for falls in (False, True)]
+    healthy, fallen = (segment([trial], ONE_BLOCK, Rig.read(rig))[0] for trial in trials)
     assert healthy.complete and fallen.failed is not None and fallen.failed.subtask == "place"
+    assert [watched(trial, ONE_BLOCK, Rig.read(rig)) for trial in trials] == [True, False]
 
 
 def test_a_tower_of_six_is_recognised_though_blocks_look_alike():
