@@ -16,7 +16,7 @@ from hmmseg.hand.signals import Signals, group_size, grouped, task_space
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Finger, Rig
 from hmmseg.io.task import BlockTask
 from hmmseg.io.trial import Trial
-from hmmseg.levels import SHOWN, SURE
+from hmmseg.levels import SURE
 from hmmseg.robust import bridged
 from hmmseg.segmentation.align import AlignedTrials
 from simgap.effects import catalogue, forms_of, free_parameters
@@ -183,15 +183,14 @@ def trial_arrays(
     force, joints, rates = (np.stack([bridged(c, t) for c in z.T], 1) for z in (force, joints, rates))
     sample = sample_noise(signals, group)
     plain = residual_noise(sample, rig, step)
-    # The finger that touches first pushes the block for a while, and so does a closing hand.
-    push = np.where(carry, 0.0, changes(mean_of(signals, "x"), sample["x"] / np.sqrt(2)))
+    # The finger that touches first pushes the block for a while, and so does a closing hand; a carried block
+    # swings in the grip as the hand speeds up.
+    push = changes(mean_of(signals, "x"), sample["x"] / np.sqrt(2))
     sd = np.hypot(plain, motion_doubt(signals, sample, push, step, group, rig.fingertip))
     sd[:, FORCES] = np.hypot(sd[:, FORCES], between_samples(t, force, free, edge & carry, boundaries))
     shaken = _shaken(signals, sample, force, carry, subtask, step, group) / rig.gravity
     sd[:, NET] = np.hypot(sd[:, NET], shaken[:, None])
-    # A carried block hangs below the grip or stands above it, by about half of its width: it swings.
-    swing = np.maximum(np.abs(force[:, 0] + force[:, 2]) - SHOWN * np.sqrt(2) * sample["force"], 0.0) * carry
-    sd[:, OFFSET] = np.hypot(sd[:, OFFSET], np.hypot(shaken, swing) / rig.fingertip.shear_stiffness)
+    sd[:, OFFSET] = np.hypot(sd[:, OFFSET], shaken / rig.fingertip.shear_stiffness)
     if trial.inertia is not None:
         sd[:, NET] = np.hypot(sd[:, NET], trial.inertia)
     there[:, np.isin(CHANNELS, absent(trial))] = 0.0
