@@ -4,7 +4,7 @@
 up to the end of a state k whose last sample is t - 1. A window holds, for each state and elapsed duration,
 the weight of having begun that long ago, and shifts by one duration per sample: time is O(num_samples
 num_states longest), memory besides the tables O(num_states longest), and samples forbidden to a state need no
-special case. The recursions run row by row on every device, so `parallel` has no effect.
+special case. The recursions run row by row on every device.
 
 Yu, Artificial Intelligence 174(2), 2010, for states in a known order.
 """
@@ -126,18 +126,16 @@ def _forward(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Ar
     return log_sum(row(leave, n) + chain.log_final, 0), enter[:-1], leave
 
 
-def evidence(x: Array, chain: DurationChain, n: Array, parallel: bool | None) -> Array:
+def evidence(x: Array, chain: DurationChain, n: Array) -> Array:
     """Log of the summed weight of all paths."""
-    del parallel
     return _forward(x, _arrays(chain), n)[0]
 
 
-def posterior(x: Array, chain: DurationChain, n: Array, parallel: bool | None) -> tuple[Array, Array, Array]:
+def posterior(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array, Array]:
     """Log evidence, and probabilities of states and moves, as recursions.posterior returns them.
 
     Moves that stay are omitted (zeros).
     """
-    del parallel
     chain = _arrays(chain)
     total, enter, leave = _forward(x, chain, n)
     longest = chain.pmf.shape[1]
@@ -165,11 +163,8 @@ def posterior(x: Array, chain: DurationChain, n: Array, parallel: bool | None) -
     return total, states, jnp.stack([jnp.zeros_like(to[0]), *to], 1)
 
 
-def draw(
-    x: Array, chain: DurationChain, n: Array, key: Array, num_draws: int, parallel: bool | None
-) -> tuple[Array, Array]:
+def draw(x: Array, chain: DurationChain, n: Array, key: Array, num_draws: int) -> tuple[Array, Array]:
     """Log evidence, and starts (num_draws, num_states) drawn from the posterior."""
-    del parallel
     chain = _arrays(chain)
     total, enter, leave = _forward(x, chain, n)
     states, (num_states, longest) = numbers(x.shape[1]), chain.pmf.shape
@@ -200,9 +195,8 @@ def draw(
     return total, jax.vmap(one)(jax.random.split(key, num_draws))
 
 
-def best_path(x: Array, chain: DurationChain, n: Array, parallel: bool | None) -> tuple[Array, Array]:
+def best_path(x: Array, chain: DurationChain, n: Array) -> tuple[Array, Array]:
     """Starts (num_states,) and log weight of the most probable path."""
-    del parallel
     starts, log_prob = rank(x, chain, n, 1)
     return starts[0], log_prob[0]
 

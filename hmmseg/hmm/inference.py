@@ -124,23 +124,23 @@ def k_best(log_likelihoods: ArrayLike, chain: AnyChain, k: int, length: Any = No
 # finite for an answer to exist, and the answer.
 
 
-def _solver(chain: Any) -> tuple[Any, tuple[Any, ...]]:
-    """The module of a chain's recursions, and its weights as their arguments."""
+def _solver(chain: Any, parallel: bool | None = None) -> tuple[Any, tuple[Any, ...], dict[str, Any]]:
+    """The module of a chain's recursions, its weights as their arguments, and how to go through time."""
     if isinstance(chain, DurationChain):
-        return durations, (chain,)
+        return durations, (chain,), {}
     initial, final = (jnp.asarray(end).astype(jnp.float64) for end in (chain.log_initial, chain.log_final))
-    return recursions, (chain.by_target(jnp), initial, final)
+    return recursions, (chain.by_target(jnp), initial, final), {"parallel": parallel}
 
 
 def _viterbi(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Alignment]:
-    solver, weights = _solver(chain)
-    starts, log_prob = solver.best_path(x, *weights, n, parallel=parallel)
+    solver, weights, how = _solver(chain, parallel)
+    starts, log_prob = solver.best_path(x, *weights, n, **how)
     return log_prob, Alignment(starts, n, log_prob)
 
 
 def _log_evidence(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
-    solver, weights = _solver(chain)
-    total = solver.evidence(x, *weights, n, parallel=parallel)
+    solver, weights, how = _solver(chain, parallel)
+    total = solver.evidence(x, *weights, n, **how)
     return total, total
 
 
@@ -153,8 +153,8 @@ def _differentiable(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | Non
 
 def _with_gradient(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Any]:
     with jax.enable_x64(True):
-        solver, weights = _solver(chain)
-        total, states, moves = solver.posterior(x, *weights, n, parallel=parallel)
+        solver, weights, how = _solver(chain, parallel)
+        total, states, moves = solver.posterior(x, *weights, n, **how)
         by_chain = None
         if isinstance(chain, Chain):
             bands = [moves[:, d, d:] for d in range(len(chain.bands))]
@@ -186,15 +186,15 @@ def _filter(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tu
 
 
 def _smooth(x: jax.Array, chain: Any, n: jax.Array, parallel: bool | None) -> tuple[Any, Posterior]:
-    solver, weights = _solver(chain)
-    total, states, moves = solver.posterior(x, *weights, n, parallel=parallel)
+    solver, weights, how = _solver(chain, parallel)
+    total, states, moves = solver.posterior(x, *weights, n, **how)
     return total, Posterior(total, states, tuple(moves[:, d, d:] for d in range(1, moves.shape[1])))
 
 
 def _sample(x: jax.Array, chain: Any, n: jax.Array, key: jax.Array, num_draws: int,
             parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
-    solver, weights = _solver(chain)
-    total, starts = solver.draw(x, *weights, n, key, num_draws, parallel)
+    solver, weights, how = _solver(chain, parallel)
+    total, starts = solver.draw(x, *weights, n, key, num_draws, **how)
     unknown = jnp.where(jnp.isfinite(total), jnp.nan, total)  # -inf if there is no path to draw
     return total, Alignments(starts, jnp.full(num_draws, n), jnp.full(num_draws, unknown))
 
@@ -202,7 +202,7 @@ def _sample(x: jax.Array, chain: Any, n: jax.Array, key: jax.Array, num_draws: i
 def _k_best(x: jax.Array, chain: Any, n: jax.Array, k: int,
             parallel: bool | None) -> tuple[Any, Alignments]:  # fmt: skip
     del parallel  # ranks are computed row by row on every device
-    solver, weights = _solver(chain)
+    solver, weights, _ = _solver(chain)
     starts, log_prob = solver.rank(x, *weights, n, k)
     return log_prob[0], Alignments(starts, jnp.full(k, n), log_prob)
 
