@@ -18,7 +18,7 @@ from estimation.report import summary
 from hmmseg.contact.decompose import FREE, ON_GROUND, SLIDING, Subtask, subtasks
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
 from hmmseg.io.task import BlockTask
-from hmmseg.levels import CERTAIN, FIRM, SURE
+from hmmseg.levels import CERTAIN, FIRM, SHOWN, SURE
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import acceleration
 
@@ -88,7 +88,6 @@ PERSISTENCE = 0.01  # prior: s over which the speed of a slipping pad varies
 DRIFTS = (0.0, 3e-5, 1e-4, 3e-4)  # prior: m per root second; of an anchor without slip
 DRIFT_PRIOR = (0.5, 0.3, 0.15, 0.05)  # prior: probabilities of DRIFTS: most pads hold still
 ANYWHERE = 0.01  # prior: m; sd of an anchor's height
-NEAR = 2.5  # chosen: noise sds below the coefficient at which a sample may slip
 
 
 @dataclass(frozen=True)
@@ -147,8 +146,9 @@ def slip_evidence(
 
 
 def _near(s: Stretch, coefficient: float) -> np.ndarray:
-    """Whether the pad may slip between successive samples (num_samples - 1,): sign of the shear, or 0."""
-    near = np.sign(s.ratio) * (np.abs(s.ratio) >= coefficient - NEAR * s.ratio_sd)
+    """Whether the pad may slip between successive samples (num_samples - 1,), as their noise does not show
+    that they are below the coefficient: sign of the shear, or 0."""
+    near = np.sign(s.ratio) * (np.abs(s.ratio) >= coefficient - SHOWN * s.ratio_sd)
     return np.where(near[1:] != 0, near[1:], near[:-1])
 
 

@@ -254,7 +254,7 @@ def bears(start: int, stop: int, pose: Pose, force: np.ndarray, tool: Tool) -> f
 LAG = 0.012
 TILT = 0.01  # prior: rad; tilt of a hand whose orientation is not recorded
 SURELY = 0.1  # chosen: s from any grip beyond which nothing is held; a touch is known to a fifth of it
-STRAY, STRAY_TIME = 0.3, 0.1  # chosen: N, s: a touch in free motion that is reported
+STRAY = 0.3  # chosen: N; a touch in free motion that is reported, if it outlasts the smoothing
 NOMINAL = 1.0  # numerics: N; force assumed for a grip of rigid pads if none was measured; any will do
 HIDDEN_GRIP = (
     "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
@@ -351,7 +351,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     free = np.ones(t.size, bool)
     for each in grips:
         free[max(each.start - 1, 0) : each.stop + 1] = False
-    strays = _strays(trial, free, np.hypot(fx, fy), tool)
+    strays = _strays(trial, free, np.hypot(fx, fy), tool, pose.window)
     for felt in (fx, fy):  # nothing is held there, whatever the wrist feels
         felt[free] = np.clip(felt[free], -SHOWN * tool.noise, SHOWN * tool.noise)
     grip = np.zeros(t.size)
@@ -426,11 +426,11 @@ def _around(t: np.ndarray, pose: Pose) -> int:
     return max(3, round(pose.window / float(np.median(np.diff(t)))) // 2 * 2 + 1)
 
 
-def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool) -> list[str]:
+def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool, window: float) -> list[str]:
     """Reports of forces in free motion, by the opening, that last."""
     t, out = trial.t, []
     for start, stop in runs(free & (np.nan_to_num(felt) > max(2 * SURE * tool.noise, STRAY))):
-        if t[stop - 1] - t[start] > STRAY_TIME:
+        if t[stop - 1] - t[start] > window:
             most = float(np.nanmax(felt[start:stop]))
             when = f"from {t[start]:.2f} to {t[stop - 1]:.2f} s, with up to {most:.2g} N"
             out.append(f"{trial.file}: the hand touches something {when}, though it holds nothing")

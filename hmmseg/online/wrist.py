@@ -209,7 +209,6 @@ def checked(rig: Rig, t: float, row: np.ndarray) -> None:
         raise InputError(where, f"a quaternion of norm {norm:.3g}", "a norm of 1 (x, y, z, w)")
 
 
-STAND = 0.1  # chosen: s of almost no motion after which the gripper stands
 LAG = 1.0  # chosen: s; default lag, and the longest that samples are held back: contacts ring for less
 NOISE = 200  # numerics: samples that determine the opening's noise
 REMEMBERED = 10.0  # numerics: s of a closing that are kept
@@ -280,9 +279,9 @@ class Opening(Closings):
             self.known = t
 
     def _close(self, t: float, opening: float) -> None:
-        """While closing, samples wait until the gripper stands."""
+        """While closing, samples wait until the gripper stands: has hardly moved over WINDOW."""
         self.known = max(self.known, t - LAG)
-        then = next((each for each in reversed(self._way) if t - each[0] >= STAND - 1e-9), None)
+        then = next((each for each in reversed(self._way) if t - each[0] >= WINDOW - 1e-9), None)
         if then is None:
             return
         speed = (then[1] - opening) / (t - then[0])
