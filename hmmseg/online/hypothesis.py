@@ -27,7 +27,7 @@ from hmmseg.contact.equations import Pads, block_width, block_y, inertia_factor
 from hmmseg.densities import EDGE, log_between, log_student
 from hmmseg.levels import MOVED, SURE, TAIL
 from hmmseg.online.compiled import compiled
-from hmmseg.segmentation.emissions import MAX_RATE, ONE_FINGER, STRAY, TOUCHING, WINDOW
+from hmmseg.segmentation.emissions import LEAST_SCALE, MAX_RATE, ONE_FINGER, STRAY, TOUCHING, WINDOW
 from hmmseg.segmentation.free_contacts import CLOSED
 
 NUM_RING = 8  # numerics: most recent boundaries remembered; a move has four
@@ -435,7 +435,7 @@ def sliding_out(h: Record, known: np.ndarray, block: int, x: Record, span: Recor
 MOST_BIAS = 2000.0  # chosen: readings that a bias remembers: sensors drift
 MOST_SCALE = 200.0  # chosen: readings that a scale remembers
 LEAST = 1e-12  # numerics: N^2, m^2; least squared scale
-FLOOR = 0.09  # chosen: least squared scale over a sample's variance: 0.3^2, as in hmmseg.segmentation.fit
+FLOOR = LEAST_SCALE**2  # squared, over a sample's variance
 
 
 @compiled

@@ -275,6 +275,9 @@ MAX_RATE = 40.0  # chosen: Hz; faster recordings are thinned to this rate, fast 
 WINDOW = 6e-3  # chosen: s over which a reading is averaged; contacts change no faster
 
 
+LEAST_SCALE = 0.3  # chosen: least scale of residuals over a sample's noise, which may be stated too large
+
+
 def noise_sd(values: np.ndarray) -> float:
     """Robust standard deviation of white sample noise, and of rounding; NaN for fewer than three samples."""
     finite = values[np.isfinite(values)]

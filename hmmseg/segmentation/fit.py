@@ -17,7 +17,7 @@ from hmmseg.hmm import Chain, em
 from hmmseg.hmm.results import AlignmentPosterior
 from hmmseg.levels import TAIL
 from hmmseg.robust import NORMAL, coarse_step, weighted_median
-from hmmseg.segmentation.emissions import Features, Parameters, log_likelihoods
+from hmmseg.segmentation.emissions import LEAST_SCALE, Features, Parameters, log_likelihoods
 from hmmseg.tables import Brief
 
 
@@ -160,7 +160,7 @@ def _widths(features: Sequence[Features], subtasks: tuple[Subtask, ...], old: Pa
         width[name] = _location(unsqueezed, gamma, spread, start)
         residuals.append(unsqueezed - width[name])
         weights.append(gamma)
-    least = 0.3 * features[0].usual["d"]
+    least = LEAST_SCALE * features[0].usual["d"]
     if not width:
         return width, old.scale["width"]
     residual, weight = np.concatenate(residuals), np.concatenate(weights)
@@ -191,8 +191,8 @@ def _rest(
     if not weights:
         return old.scale["velocity"], old.scale["level"], tuple(levels)
     gamma = np.concatenate(weights)
-    least_v = 0.3 * float(np.median(np.concatenate([f.sd_vy for f in features])))
-    least_y = 0.3 * float(np.median(np.concatenate([f.sd_y for f in features])))
+    least_v = LEAST_SCALE * float(np.median(np.concatenate([f.sd_vy for f in features])))
+    least_y = LEAST_SCALE * float(np.median(np.concatenate([f.sd_y for f in features])))
     return (
         _scale(np.concatenate(velocity), gamma, max(old.scale["velocity"], least_v), least_v),
         _scale(np.concatenate(level), gamma, max(old.scale["level"], least_y), least_y),
