@@ -290,6 +290,7 @@ class Search:
                 goes back towards its point from a beginning that is worse.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
+        begin = begin if near is None else self._begun_on_samples(begin, scales, near)
         best, key, starts = None, frozenset(names), {} if near is None else near.linear.starts
         here = (self.composed if near is None else near.composed).moved(begin)
         known = begin if near is None else {n: near.point[n] for n in begin if n in near.point}
@@ -315,6 +316,27 @@ class Search:
         if key not in self.fitted or self.fitted[key].score < best.score:
             self.fitted[key] = best
         return self.fitted[key]
+
+    def _begun_on_samples(self, begin: Point, scales: Sequence[Whitener], near: FittedSet) -> Point:
+        """The beginning of a fit, or that with times of commands at whole samples and what is fitted along as
+        it was, if that is closer to the logs.
+
+        Forces of stiff servos jump with their commands, so lateness has an optimum at every sample, and
+        straight lines lead beside it.
+        """
+        step, whole = float(np.median(np.diff(self.composed.recordings[0].t))), dict(begin)
+        for name, theta in begin.items():
+            effect = self.composed.effects[name]
+            timed = [n for n, p in effect.parameters.items() if effect.command is not None and p.unit == "s"]
+            whole[name] = {**theta, **{n: step * round(theta[n] / step) for n in timed}}
+        if whole == begin:
+            return begin
+
+        def closeness(point: Point) -> float:
+            rows = base_at(near.composed.moved(point), point).rows
+            return _best_level(scales, near.linear.target - rows) if np.isfinite(rows).any() else -np.inf
+
+        return max(begin, whole | {n: near.point[n] for n in self.along}, key=closeness)
 
     def _begun_anew(self, one: FittedSet, leading: FittedSet) -> tuple[Composed, Linear, float]:
         """The model with windows run from where a set's fit puts their starts, the gap there, and by how much
