@@ -138,11 +138,17 @@ class Output:
         return self._console.lost
 
     @contextlib.contextmanager
-    def progress(self, text: str, total: int) -> Iterator[Callable[..., None]]:
-        """A progress bar on standard error; yields a function that advances it and may set its text."""
+    def progress(self, text: str, total: int, timed: bool = True) -> Iterator[Callable[..., None]]:
+        """A progress bar on standard error; yields a function that advances it and may set its text.
+
+        `timed`: the bar tells the time left, by the speed of its latest steps.
+        """
         from rich.progress import Progress
 
-        with Progress(console=self._side, transient=True, disable=not self._side.is_terminal) as bar:
+        columns = Progress.get_default_columns()[: None if timed else -1]
+        with Progress(
+            *columns, console=self._side, transient=True, disable=not self._side.is_terminal
+        ) as bar:
             task = bar.add_task(text, total=total)
             yield lambda steps, now=text: bar.update(task, advance=steps, description=now)
 

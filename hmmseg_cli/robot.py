@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from hmmseg.errors import InputError
@@ -112,25 +113,39 @@ def fitted_effects(
 
 
 @contextmanager
-def show_stages(out: Output, text: str, total: int) -> Iterator[Progress]:
-    """Progress by stages; yields their callback. InputError if the simulation diverges far from the logs."""
+def show_stages(
+    out: Output, text: str, total: int, over: Mapping[str, float] | None = None
+) -> Iterator[Progress]:
+    """Progress by stages; yields their callback. InputError if the simulation diverges far from the logs.
+
+    `over`: share of the time that is over when a stage whose name begins so begins, from which the time left
+    is told; without it stages are counted.
+    """
     from numpy.linalg import LinAlgError
 
     from simgap.progress import heard
 
-    stage = text
+    stage, done, begun = text, 0.0, monotonic()
 
     def tell(text: str) -> None:
-        nonlocal stage
+        nonlocal stage, done
+        shares = [share for name, share in (over or {}).items() if text.startswith(name)]
+        before, done = done, max(done, total * shares[0]) if shares else done + 1
         stage = text
-        advance(1, text)
+        if shares:
+            stage += f", about {(monotonic() - begun) * (total / done - 1):.0f} s left"
+        advance(done - before, stage)
 
-    with out.progress(text, total=total) as advance, heard(lambda text: advance(0, f"{stage}: {text}")):
+    with (
+        out.progress(text, total=total, timed=not over) as advance,
+        heard(lambda text: advance(0, f"{stage}: {text}")),
+    ):
         try:
             yield tell
         except LinAlgError:
             near = "a model that stays near its logs: a shorter time step?"
-            raise InputError("simulator", f"runs far away from the logs ({stage})", near) from None
+            where = stage.partition(",")[0]
+            raise InputError("simulator", f"runs far away from the logs ({where})", near) from None
 
 
 def warn_of_engine(out: Output, own: OwnSimulator) -> None:
@@ -198,7 +213,7 @@ def diagnose_robot(
 ) -> None:
     """Read, diagnose, and write table, figures, page, patch and document to the destinations of `out`."""
     from simgap.robots.describe import body
-    from simgap.robots.diagnose import STAGES, diagnose
+    from simgap.robots.diagnose import OVER, diagnose
 
     at_risk, recordings, loaded = read_logs(out, paths, own)
     more = [] if loaded is None else loaded.effects(recordings)
@@ -209,7 +224,7 @@ def diagnose_robot(
         from simgap.robots.rows import phases_by_task
 
         phases = phases_by_task(recordings, read_task(task), f"--task {task}")
-    with show_stages(out, "diagnosing", STAGES) as tell:
+    with show_stages(out, "diagnosing", 1, OVER) as tell:
         found = diagnose(at_risk, recordings, forced=tuple(dict.fromkeys(effect)), seed=out.seed, more=more,
                          length=length, phases=phases, tell=tell, warn=out.warn, note=out.print)  # fmt: skip
     document = body(found)

@@ -66,9 +66,10 @@ class Composed:
         return cls(simulator, tuple(recordings), windows, effects, noise, rows, motion=motion)
 
     def calm(self) -> Composed:
-        """The same without windows of bodies that move in contact, unless there are no others."""
+        """The same without windows of bodies that move in contact, unless some log has no others."""
         kept = [k for k, w in enumerate(self.windows) if w.regime != STRIKES]
-        if not kept or len(kept) == len(self.windows):
+        logs = {self.windows[k].log for k in kept}
+        if logs < {w.log for w in self.windows} or len(kept) == len(self.windows):
             return self
         return replace(self.among(kept), wobble=None)
 

@@ -50,6 +50,7 @@ USUAL = 1.0  # numerics: usual sizes by which a candidate that does not act yet 
 LEAVES = 2.0  # numerics: squares over the noise's from which a search from the calibration follows
 SMALL = 0.01  # numerics: usual sizes; what calibration moved by less stays
 NEAR = 10.0  # numerics: nats by which a proposal of a replacement may be wrong
+REPLACES = 0.5  # numerics: share of what a cause explains that lines have a replacement explain at least
 FAR = 30.0  # numerics: usual sizes to which a straight line is trusted
 BETTER = 2.0  # numerics: nats by which a set must be better for the search to go on from it
 SETTLED = 0.3  # numerics: nats to which the leading sets are fitted in the end, as three rule one out
@@ -196,7 +197,8 @@ class Search:
         """The empty set: only what is fitted along."""
         point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
         if any(w.regime == STRIKES for w in self.composed.windows):
-            every = linearise(self.composed, point, [*self.along, *self.wanted])
+            every, base = linearise(self.composed, point, self.along), base_at(self.composed, point)
+            every = every.with_moved(self._rolled_out(self.composed, base, self.wanted))
             self.composed = with_wobble(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
         return self.fit((), point, [covariances(self.composed, linear).whitener()])
@@ -216,7 +218,6 @@ class Search:
                 anew = self.fit((), point, [better.whiten], near=better)
                 if not self._is_better(better, anew):
                     best = anew
-                    self.columns.clear()
                     continue
             best = better
         return best
@@ -245,10 +246,7 @@ class Search:
             sets, levels, _ = self._columns_at(end, self.wanted)
             every = [(), *neighbours((), sets.names)]
             promised.append(max(float(sets.scores(every, k).max()) for k in range(len(levels))))
-        best = int(np.argmax(promised))
-        if best > 0:
-            self.columns.clear()
-        return ends[best]
+        return ends[int(np.argmax(promised))]
 
     def _from_calibration(self) -> FittedSet | None:
         """The set of what calibration moved, less what it can do without in closed form."""
@@ -292,6 +290,7 @@ class Search:
                 goes back towards its point from a beginning that is worse.
         """
         say(f"fitting {' + '.join(names) or 'nothing'}")
+        begin = begin if near is None else self._begun_on_samples(begin, scales, near)
         best, key, starts = None, frozenset(names), {} if near is None else near.linear.starts
         here = (self.composed if near is None else near.composed).moved(begin)
         known = begin if near is None else {n: near.point[n] for n in begin if n in near.point}
@@ -317,6 +316,27 @@ class Search:
         if key not in self.fitted or self.fitted[key].score < best.score:
             self.fitted[key] = best
         return self.fitted[key]
+
+    def _begun_on_samples(self, begin: Point, scales: Sequence[Whitener], near: FittedSet) -> Point:
+        """The beginning of a fit, or that with times of commands at whole samples and what is fitted along as
+        it was, if that is closer to the logs.
+
+        Forces of stiff servos jump with their commands, so lateness has an optimum at every sample, and
+        straight lines lead beside it.
+        """
+        step, whole = float(np.median(np.diff(self.composed.recordings[0].t))), dict(begin)
+        for name, theta in begin.items():
+            effect = self.composed.effects[name]
+            timed = [n for n, p in effect.parameters.items() if effect.command is not None and p.unit == "s"]
+            whole[name] = {**theta, **{n: step * round(theta[n] / step) for n in timed}}
+        if whole == begin:
+            return begin
+
+        def closeness(point: Point) -> float:
+            rows = base_at(near.composed.moved(point), point).rows
+            return _best_level(scales, near.linear.target - rows) if np.isfinite(rows).any() else -np.inf
+
+        return max(begin, whole | {n: near.point[n] for n in self.along}, key=closeness)
 
     def _begun_anew(self, one: FittedSet, leading: FittedSet) -> tuple[Composed, Linear, float]:
         """The model with windows run from where a set's fit puts their starts, the gap there, and by how much
@@ -379,7 +399,7 @@ class Search:
         """
         composed, held = at.composed, at.names
         sets, levels, linear = self._columns_at(at, names)
-        if not held:
+        if not held and {*self.wanted} <= {*names}:
             self.identifiable = identifiability(*sets.product())
             self.diverged = tuple(n for n in names if n not in linear.moved)
         base = base_at(composed, at.point)
@@ -392,20 +412,20 @@ class Search:
     def _columns_at(self, at: FittedSet, names: Sequence[str]) -> tuple[Sets, list[Whitener], Linear]:
         """Candidates along straight lines about the point of a set: in closed form, its levels of the
         discrepancy, and the linearised gap."""
-        composed, more = at.composed, dict[str, Moved]()
-        base = base_at(composed, at.point)
-        for name in names:
-            if name not in at.names:
-                if name not in self.columns:
-                    say(f"what {name} would do")
-                    size = np.full(len(composed.effects[name].parameters), USUAL)
-                    self.columns[name] = vary(composed, base, name, step=size)
-                one = self.columns[name]
-                more |= {} if one is None else {name: one}
-        linear = at.linear.with_moved(more)
+        others, base = [n for n in names if n not in at.names], base_at(at.composed, at.point)
+        linear = at.linear.with_moved(self._rolled_out(at.composed, base, others))
         scales = [{n: s * k for n, s in at.discrepancy.items()} for k in LEVELS if at.discrepancy]
         levels = [at.covariances.whitener(d, at.wide) for d in (*scales, NONE)]
         return self._sets(linear, levels, names), levels, linear
+
+    def _rolled_out(self, composed: Composed, base: Base, names: Sequence[str]) -> dict[str, Moved]:
+        """Candidates that do not diverge, rolled out by their usual size where they were not before."""
+        for name in names:
+            if name not in self.columns:
+                say(f"what {name} would do")
+                size = np.full(len(composed.effects[name].parameters), USUAL)
+                self.columns[name] = vary(composed, base, name, step=size)
+        return {n: one for n in names if (one := self.columns[n]) is not None}
 
     def _roll_out_leaders(
         self, composed: Composed, base: Base, linear: Linear, sets: Sets, levels: Sequence[Whitener],
@@ -452,7 +472,8 @@ class Search:
 
         `at` is the best itself, or the best less one cause, whose replacements are then sought.
         """
-        sets, levels = latest(self._proposed, at, lambda: self.propose(at, self.wanted))
+        names = self.wanted if at is best else self._rivals(at, best)
+        sets, levels = latest(self._proposed, (at, names), lambda: self.propose(at, names), 2)
         near = neighbours(at.names, sets.names)
         near += [sets.pruned(at.names, 0)] if len(at.names) > 1 else []
         singles = len(near)
@@ -465,6 +486,7 @@ class Search:
         if at is not best:  # straight lines miss as much of a replacement as they miss of the best itself
             of_best = score.max(0)[[{*names} == {*best.names} for names in near]]
             least = min(0.0, *(of_best - own + at.score - best.score)) - NEAR
+        tolerated = -_unsure(best.score - at.score)
         found, order, learned, wrong = best, np.argsort(-promised), 0, -np.inf
         # Of a large gap lines promise too little of one effect and too much of two: one alone is tried first.
         for part in (order,) if at.names else (order[order < singles], order[order >= singles]):
@@ -472,8 +494,9 @@ class Search:
                 least = max(least, found.score - best.score + NEAR)
             tried = 0
             for k in part:
-                # Two replacements are fitted to the end whatever lines promise: these may miss by more.
-                learns = at is not best and learned < LEARNED
+                # Two replacements are fitted to the end even so, if lines have them replace enough: these may
+                # miss by more.
+                learns = at is not best and learned < LEARNED and promised[k] > tolerated
                 if tried >= TRIED or (promised[k] < least and not learns):
                     break
                 names = near[k]
@@ -492,6 +515,19 @@ class Search:
                 if learned >= LEARNED:  # other promises are wrong by as much as these were
                     least = max(least, found.score - best.score - NEAR - wrong)
         return None if found is best else found
+
+    def _rivals(self, less: FittedSet, best: FittedSet) -> Names:
+        """Effects of the best set, and those that may do what it has and `less` lacks.
+
+        Straight lines about the best have them make up for REPLACES of what is lost, or all but NEAR.
+        """
+        sets, levels = latest(self._proposed, (best, self.wanted), lambda: self.propose(best, self.wanted), 2)
+        others, out = [n for n in sets.names if n not in best.names], {*best.names}
+        tried = [best.names, less.names, *((*less.names, n) for n in others)]
+        for level in range(len(levels)):
+            own, lost, *left = sets.scores(tried, level)
+            out |= {n for n, score in zip(others, left, strict=True) if own - score < _unsure(own - lost)}
+        return tuple(n for n in self.wanted if n in out)
 
     def predicts_better(self, one: FittedSet, other: FittedSet, by: FittedSet) -> bool:
         """Whether a set predicts held-out folds better than another.
@@ -550,6 +586,11 @@ class Search:
             if there is not None:
                 return there
         return None
+
+
+def _unsure(lost: float) -> float:
+    """Nats by which lines may have a replacement stay behind a cause without which `lost` nats are lost."""
+    return max(NEAR, (1 - REPLACES) * lost)
 
 
 def _best_level(levels: Sequence[Whitener], residual: np.ndarray) -> float:

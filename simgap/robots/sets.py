@@ -31,7 +31,7 @@ from simgap.robots.model import Point
 from simgap.robots.whiten import Whitener
 
 TURNS = 6  # numerics: iterations of reweighted least squares
-PIVOTS = 4  # numerics: exchanges of bounds for many sets at once
+PIVOTS = 8  # numerics: exchanges of bounds for many sets at once
 
 Names = tuple[str, ...]
 

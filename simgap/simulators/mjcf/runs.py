@@ -131,44 +131,46 @@ class Runs:
     def __call__(
         self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[tuple[str, float], ...]
     ) -> list[Channels | None]:
-        """Channels along logs from states (B, size) with some settings changed, None of one that diverged."""
-        longest = max(float(log.t[-1] - log.t[0]) for log in logs)
-        numbers = first.shape[1] + self.model.nsensordata + self.model.nv
-        size = max(1, int(BATCH / ((longest / self.model.opt.timestep + 2) * numbers)))
-        out: list[Channels | None] = []
-        for a in range(0, len(logs), size):
-            out += self._roll(logs[a : a + size], first[a : a + size], changed)
+        """Channels along logs from states (B, size) with some settings changed, None of one that diverged.
+
+        Logs with equally many samples run together, so that none runs on to another's end.
+        """
+        alike: dict[int, list[int]] = defaultdict(list)
+        for i, log in enumerate(logs):
+            alike[len(log)].append(i)
+        h, sensors = float(self.model.opt.timestep), max(self.model.nsensordata, 1)
+        steps = np.array([(log.t[-1] - log.t[0]) / h + 2 for log in logs])
+        kept = len(alike) * max(1, int(KEPT / (8 * sensors * steps.sum())))
+        out: list[Channels | None] = [None] * len(logs)
+        for every in alike.values():
+            size = max(1, int(BATCH / (steps[every].max() * (first.shape[1] + sensors + self.model.nv))))
+            for mine in (every[a : a + size] for a in range(0, len(every), size)):
+                found = self._roll([logs[i] for i in mine], first[mine], changed, kept)
+                for i, channels in zip(mine, found, strict=True):
+                    out[i] = channels
         return out
 
     def _roll(
-        self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[Any, ...]
+        self, logs: Sequence[Recording], first: np.ndarray, changed: tuple[Any, ...], kept: int
     ) -> list[Channels | None]:
         h = float(self.model.opt.timestep)
         span = max(float(log.t[-1] - log.t[0]) for log in logs)
         times = np.arange(int(np.ceil(span / h - 1e-9)) + 2) * h
-        alike: dict[int, list[int]] = defaultdict(list)
-        for i, log in enumerate(logs):
-            alike[len(log)].append(i)
-        parts = [(mine, [logs[i] for i in mine]) for mine in alike.values()]
-        sides = [self._side(own, times) for _, own in parts]
+        side = self._side(logs, times, kept)
         control = np.zeros((len(logs), times.size, self.model.nu))
         line, late, smooth = (dict(changed).get(name, 0.0) for name in (HOLD, LATE, SMOOTH))
         smooth = max(smooth, line * smooth)  # steps have no curve
-        for (mine, own), (plain, _) in zip(parts, sides, strict=True):
-            # A loop that sets a command and makes a step has the line where the step begins, not its mean.
-            held = _carried_out(own, plain, (late + 0.5 * line) * h)
-            for column, place in self.driven.items():
-                asked = np.array([_commanded(log, column) for log in own])
-                asked[:, 1:-1] += 0.5 * smooth * np.diff(asked, 2)
-                control[mine, :, place] = held(asked, line)
-        sensed = self._sensed(first, control, changed)
-        out: list[Channels | None] = [None] * len(logs)
-        for (mine, own), side in zip(parts, sides, strict=True):
-            for i, channels in zip(mine, self._read(own, sensed[mine], side, times), strict=True):
-                out[i] = channels
-        return out
+        # A loop that sets a command and makes a step has the line where the step begins, not its mean.
+        held = _carried_out(logs, side[0], (late + 0.5 * line) * h)
+        for column, place in self.driven.items():
+            asked = np.array([_commanded(log, column) for log in logs])
+            asked[:, 1:-1] += 0.5 * smooth * np.diff(asked, 2)
+            control[:, :, place] = held(asked, line)
+        return self._read(logs, self._sensed(first, control, changed, kept), side, times)
 
-    def _sensed(self, first: np.ndarray, control: np.ndarray, changed: tuple[Any, ...]) -> np.ndarray:
+    def _sensed(
+        self, first: np.ndarray, control: np.ndarray, changed: tuple[Any, ...], kept: int
+    ) -> np.ndarray:
         """Sensors (B, steps, sensors) of runs from these states."""
         laws = Laws.of(self.model, changed)
 
@@ -182,14 +184,13 @@ class Runs:
 
         given = hashlib.blake2b(first.tobytes() + control.tobytes()).digest()
         key = (changed, first.shape, control.shape, given)
-        size = 8 * len(first) * control.shape[1] * max(self.model.nsensordata, 1)
-        return latest(self._ran, key, run, int(KEPT / size))
+        return latest(self._ran, key, run, kept)
 
-    def _side(self, logs: Sequence[Recording], times: np.ndarray) -> tuple[Held, Between]:
+    def _side(self, logs: Sequence[Recording], times: np.ndarray, kept: int) -> tuple[Held, Between]:
         """How windows with equally many samples lie on the steps: for their commands and their sensors."""
         since = np.array([log.t - log.t[0] for log in logs])
         key = (since.shape, since.tobytes(), times.size, float(times[1]))
-        return latest(self._sides, key, lambda: (Held(since, times), Between(since, times)))
+        return latest(self._sides, key, lambda: (Held(since, times), Between(since, times)), kept)
 
     def _read(
         self, logs: Sequence[Recording], sensed: np.ndarray, side: tuple[Held, Between], times: np.ndarray

@@ -96,7 +96,7 @@ def sizes_of(motions: Sequence[Motion], joint: int) -> Sizes:
 
 
 SPAN = 2 * REACH  # chosen: s over which a motion is smoothed by a cubic, as a window's start is
-OFTEN = 100.0  # limit: periods per turn; at 1 rad/s SPAN smooths what comes as often as that away
+OFTEN = 100.0  # limit: periods per turn, and rad/s of what comes and goes; SPAN smooths what is faster away
 
 
 def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
@@ -109,10 +109,10 @@ def periods(motions: Sequence[Motion], joint: int, scaled: bool) -> float:
         np.concatenate([getattr(m, name)[joint][m.rows] for m in motions])
         for name in ("position", "rate", "torque", "motor")
     )
-    span = float(np.ptp(q))
-    if span * OFTEN < 4 * np.pi:
+    span, most = float(np.ptp(q)), OFTEN / max(1.0, float(np.median(np.abs(rate))))
+    often = np.arange(max(2.0, np.pi / max(span, 1e-9)), most, np.pi / (4 * max(span, 1e-9)))
+    if span * most < 4 * np.pi or not often.size:
         return 0.0
-    often = np.arange(max(2.0, np.pi / span), OFTEN, np.pi / (4 * span))
     slow = np.column_stack([q**0, q, np.sin(q), np.cos(q), rate, np.sign(rate), motor, motor * q])
     basis = np.linalg.qr(slow / np.maximum(np.abs(slow).max(0), 1e-12))[0]
     left = torque - motor
