@@ -219,12 +219,15 @@ def attribute(
     detection = detected(value)
     noise = noise_of(f, models[0])
     by_group = (noise**2)[channel_of(f)]
-    ranked, others = [m.effects for m in models if m.effects][:EXAMINED], None
+    # A set that needs a parameter that no hand has is none.
+    possible = models if forced else [m for m in models if not _is_absurd(f, m)]
+    ranked, others = [m.effects for m in possible if m.effects][:EXAMINED], None
     if heldout and (detection.p_value < ALARM or forced):
         others = Heldout.of(f, noise**2, (j for effects in ranked for j in effects))
     examined = {effects: _examined(f, effects, models, by_group, rng, others) for effects in ranked}
     sets = [
-        _explanation(f, m.effects, float(x), examined) for m, x in zip(models, weights(models), strict=True)
+        _explanation(f, m.effects, float(x), examined)
+        for m, x in zip(possible, weights(possible), strict=True)
     ]
     small = None
     if gap.tolerance is not None and (detection.p_value < ALARM or forced):
