@@ -219,8 +219,12 @@ def attribute(
     detection = detected(value)
     noise = noise_of(f, models[0])
     by_group = (noise**2)[channel_of(f)]
-    # A set that needs a parameter that no hand has is none.
-    possible = models if forced else [m for m in models if not _is_absurd(f, m)]
+    # A set that needs a parameter that no hand has is none; what it has besides may be one.
+    possible = models
+    if not forced:
+        found = {m.effects: m for m in models}
+        left = dict.fromkeys(_without_absurd(f, m) for m in models)
+        possible = sorted((found.get(e) or fitted(f, e) for e in left), key=lambda m: -m.score)
     ranked, others = [m.effects for m in possible if m.effects][:EXAMINED], None
     if heldout and (detection.p_value < ALARM or forced):
         others = Heldout.of(f, noise**2, (j for effects in ranked for j in effects))
@@ -360,25 +364,26 @@ def _examined(
     elif others is not None and {*causes} - scattering:
         share = 0.0  # the held-out trials show no gap to explain
     sure = 0.0
-    if causes and not _is_absurd(f, fitted(f, causes)):
+    if causes and len(_without_absurd(f, fitted(f, causes))) == len(causes):
         part = explained.each.mean(0) + 1e-9
         form = np.sqrt(part @ np.square([f.gap.candidates[j].form for j in effects]) / part.sum())
         sure = known(share, detected(statistic(f, models, causes)).p_value, form)
     return _Examined(model, explained, causes, sure)
 
 
-def _is_absurd(f: Forms, model: Model) -> bool:
-    """Whether a parameter of a set is at a bound that no hand reaches.
+def _without_absurd(f: Forms, model: Model) -> tuple[int, ...]:
+    """Effects of a set but for those of which a parameter is at a bound that no hand reaches.
 
     Its neutral value is possible, and times or frequencies end where recordings tell no more of them.
     """
+    absurd = set[int]()
     for j, own in coordinates(f, model.effects).items():
         c = f.gap.candidates[j]
         reached = model.at_bound[own] & ~np.isclose(c.scale * model.x[own], 0.0, atol=1e-6)
         linear = np.ones(own.size, bool) if c.size is None else np.isnan(c.size)
         if (reached & linear & ~np.isin(c.parameters, c.hidden)).any():
-            return True
-    return False
+            absurd.add(j)
+    return tuple(j for j in model.effects if j not in absurd)
 
 
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:

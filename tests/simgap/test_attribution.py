@@ -232,6 +232,10 @@ def test_a_cause_at_a_bound_that_no_hand_reaches_is_held_back():
     assert verdict(low=-2.0, high=3.5) == "named" and verdict(high=2.0) == "unknown"
     hidden = replace(first, high=np.full(1, 2.0), hidden=first.parameters)
     assert attribute(replace(gap, candidates=(hidden, *rest)), heldout=False).verdict == "named"
+    both = gap_of({0: 20.0, 1: 2.0})  # one beside it does not hold a cause back that explains 99 %
+    first, second, *rest = both.candidates
+    second = replace(second, high=np.full(1, 1.6))
+    assert attribute(replace(both, candidates=(first, second, *rest)), heldout=False).causes == ("a",)
 
 
 def test_a_tolerant_prior_leaves_what_matters_as_likely_and_rounding_no_probability_above_one():
