@@ -31,6 +31,7 @@ STATED = 0.3  # prior: sd of log variance about the stated one: noise is stated 
 OFF = (0.002, 0.01, 0.03, 0.1)
 WITHIN = 0.5  # prior: share of groups that are off, of those that an effect frees
 NEAR, FAR = 13, 20  # numerics: points of the grid
+WIDEST = 3.0  # numerics: standard deviations that its first part spans to either side
 NEAR_BY = 3.5 * STATED  # numerics: log variance that separates the two parts of the grid
 LARGEST = 1e6  # numerics: largest variance over the stated one
 
@@ -50,7 +51,7 @@ class Background:
     def usual(cls, *off: float) -> Background:
         """Noise about as stated, or the model off, in shares OFF of the groups unless others are given."""
         grid = np.concatenate(
-            [np.linspace(-3, 3, NEAR) * STATED, np.linspace(4 * STATED, np.log(LARGEST), FAR)]
+            [np.linspace(-WIDEST, WIDEST, NEAR) * STATED, np.linspace(4 * STATED, np.log(LARGEST), FAR)]
         )
         far = np.arange(grid.size) >= NEAR
         normal = np.where(far, 0.0, np.exp(-0.5 * (grid / STATED) ** 2))
@@ -83,6 +84,9 @@ class Background:
         """
         log_phi = self.log_phi[:, None] + shift
         precision = np.exp(-log_phi)
+        # What a random effect scatters less than usual, as rounding does a force of zero, is no better for
+        # being quieter yet.
+        energy = np.maximum(energy, count * np.expm1(shift) * np.exp(-WIDEST * STATED))
         each = -0.5 * (count * log_phi + energy * precision)
         peak = each.max(axis=0)
         chance = np.exp(each - peak)

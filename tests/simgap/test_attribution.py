@@ -67,6 +67,8 @@ def test_cosines_are_orthonormal_and_the_background_is_the_integral_over_varianc
             assert precision[s, g] == pytest.approx(float(each @ np.exp(-b.log_phi) / np.sum(each)))
     assert (precision[:, 0] > 0.5).all() and precision[:, 1] == pytest.approx(20 / 400, rel=0.25)
     assert b.near.sum() == pytest.approx(1.0) and b.far.sum() == pytest.approx(1.0)
+    quiet = [b.marginal(np.array([20.0 * e]), np.array([20.0]), np.log(9.0))[0] for e in (6, 3, 1)]
+    assert (quiet[0] < quiet[1]).all() and quiet[1] == pytest.approx(quiet[2])
 
 
 def enumerated(gap: Gap) -> dict[tuple[int, ...], float]:
