@@ -79,10 +79,11 @@ def tracked(
     standard deviation `sd`; each has a `weight` from 0 to 1. The first, second and last value also have a
     constant each, a random walk of variances `walk` (T, N, 3) that is replaced by a new one of variance
     `anywhere` where `new` (T, N, 3): the first weighted value determines it and gives no innovation. A joint
-    is at its `place` (T, N, J) where `pinned`; elsewhere it moves by `drift` with variance `wander`, plus one
-    of `shares` (R,) of the variance `jump` (T, J), as often after the last one as in the trial so far (each
-    once beforehand). The density of a sample is the mean over shares; the likeliest one is kept (a
-    multiprocess model, class II: Harrison & Stevens, JRSS B 38, 1976).
+    is at its `place` (T, N, J) where `pinned`; elsewhere all rest, at a share 0, or move by `drift` with
+    variance `wander` plus one of `shares` (R,) of the variance `jump` (T, J), each share as often after the
+    last one as in the trial so far (once beforehand): noise of speeds is no motion of a hand at rest. The
+    density of a sample is the mean over shares; the likeliest one is kept (a multiprocess model, class II:
+    Harrison & Stevens, JRSS B 38, 1976).
 
     Returns:
         Innovations (T, N, 4), their variances over the noise's, and what the mean lacks of the density of the
@@ -110,16 +111,17 @@ def tracked(
                     cov[:, j] = 0.0
                     mean[j] = place[t, k, j]
                     cov[j, j] = 0.0 if pinned[t, k, j] else jump[t, j]
-                else:
-                    mean[j] += drift[t, k, j]
-                    cov[j, j] += wander[t, k, j]
                 loose = loose or not pinned[t, k, j]
             choices = shares.size if loose and weight[t, k].sum() > 0 else 1
             chance, kept = followed[last] / followed[last].sum(), 0
             best, chosen_mean, chosen_cov, seen, every = -np.inf, mean, cov, 0.0, -np.inf
             for r in range(choices):
                 m, p = (mean.copy(), cov.copy()) if choices > 1 else (mean, cov)
+                moves = choices == 1 or shares[r] > 0
                 for j in range(joints):
+                    if moves and k > 0 and not pinned[t, k, j]:
+                        m[j] += drift[t, k, j]
+                        p[j, j] += wander[t, k, j]
                     if not pinned[t, k, j]:
                         p[j, j] += shares[r] * jump[t, j]
                 score = np.log(chance[r]) if choices > 1 else 0.0

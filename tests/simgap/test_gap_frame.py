@@ -281,7 +281,7 @@ def test_noise_smooth_motion_and_pushes_have_no_kinks_and_touches_no_speeds():
 DT = 0.05  # s
 
 
-def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares=(0.0,)):
+def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares=(0.0,), wander=1e-6):
     """What the filter makes of one trial's values (N, 4). `joints`: levers, pinned, place and jump of two."""
     n = len(values)
     levers, pinned, place, jump = joints or (np.zeros((n, 4, 0)), np.zeros((n, 0)) > 0, np.zeros((n, 0)), 0.0)
@@ -289,7 +289,7 @@ def _tracked(values, sd, *, weight=1.0, walk=0.0, new=False, joints=None, shares
     return tracked(values[None], np.broadcast_to(weight, (1, n, 4)) * 1.0, np.full((1, n, 4), sd),
                    levers[None], np.broadcast_to(np.reshape(walk, (-1, 1)), (1, n, 3)) * 1.0,
                    np.broadcast_to(new, (1, n, 3)) > 0, ANYWHERE**2, pinned[None], place[None], still,
-                   still + 1e-6, np.full((1, place.shape[1]), jump), np.asarray(shares))  # fmt: skip
+                   still + wander, np.full((1, place.shape[1]), jump), np.asarray(shares))  # fmt: skip
 
 
 def _cost(found, sd, channel) -> float:
@@ -406,6 +406,11 @@ def test_a_joint_that_jumps_unseen_costs_one_choice_and_is_followed():
     assert 12 in jumped and jumped.size <= 2
     others = np.setdiff1d(np.arange(2, n), jumped)
     assert np.sqrt(np.mean(out[0, others, 2] ** 2 / factor[0, others, 2])) < 1.5 * sd
+    # A joint that rests is as well known as it reads, however noisy its speed.
+    rests = levers, joints[1], start, 0.0
+    values = (levers * start[:, None]).sum(-1) + sd * rng.standard_normal((n, 4))
+    factor = _tracked(values, sd, joints=rests, shares=(0.0, 1.0), wander=1.0)[1]
+    assert np.median(factor[0, :, 2]) < 1.2
 
 
 def test_the_ring_of_a_straight_load_is_exact_and_is_taken_out_again():
