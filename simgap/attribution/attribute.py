@@ -354,7 +354,12 @@ def _examined(
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
-    causes = tuple(j for j in effects if j in scattering or _needed(f, model, j))
+    causes = effects
+    while certain := {j: _certainty(f, causes, j) for j in causes if j not in scattering}:
+        least = min(certain, key=lambda j: certain[j])
+        if certain[least] > 0:
+            break
+        causes = tuple(j for j in causes if j != least)
     if others is not None:
         causes = _predicting(others, causes)
     share = 1 - explained.remainder
@@ -404,25 +409,25 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
     return causes
 
 
-def _needed(f: Forms, model: Model, effect: int) -> bool:
-    """Whether an effect of a set is needed.
+def _certainty(f: Forms, effects: tuple[int, ...], effect: int) -> float:
+    """Evidence [nats] for an effect of a set beyond that at which it is needed.
 
-    Its evidence must exceed RULED_OUT and what errors in the forms of the other effects may imitate: a share
-    of what the residuals say for the set, not of evidence from other sources, divided among them by what each
-    of them adds. A single effect is needed if there is a gap.
+    It must exceed RULED_OUT and what errors in the forms of the other effects may imitate: a share of what
+    the residuals say for the set, not of evidence from other sources, divided among them by what each of them
+    adds. A single effect is needed if there is a gap.
     """
-    others = tuple(j for j in model.effects if j != effect)
+    others, model = tuple(j for j in effects if j != effect), fitted(f, effects)
     if not others:
-        return True
+        return np.inf
     of = [f.gap.candidates[j] for j in others]
 
     def added(j: int) -> float:
-        return model.score - fitted(f, tuple(i for i in model.effects if i != j)).score
+        return model.score - fitted(f, tuple(i for i in effects if i != j)).score
 
     shown = model.score - fitted(f, ()).score - sum(max(c.evidence, 0.0) for c in of)
     parts = np.maximum([added(j) for j in others], np.log(RULED_OUT))
     feigned = shown * np.average([c.form for c in of], weights=parts)
-    return bool(added(effect) > max(np.log(RULED_OUT), feigned))
+    return float(added(effect) - max(np.log(RULED_OUT), feigned))
 
 
 def _effects(

@@ -9,7 +9,7 @@ from refusals import refused
 from scipy.optimize import lsq_linear
 
 from simgap.attribution import search, verdict
-from simgap.attribution.attribute import _examined, _needed, _predicting, attribute, noise_of
+from simgap.attribution.attribute import _certainty, _examined, _predicting, attribute, noise_of
 from simgap.attribution.heldout import RESPONSE, Heldout, scatter_between
 from simgap.attribution.posterior import OFF, Background, fitted, forms, mode, quadratic_forms, screened
 from simgap.attribution.problem import MODELLED, Candidate, Gap, Rows, cosines
@@ -457,7 +457,19 @@ def test_a_small_cause_beside_a_large_one_is_needed_where_the_form_of_the_large_
     f = forms(replace(gap, candidates=(replace(large, form=form), *others)))
     both, alone = fitted(f, (0, 2)), fitted(f, (0,))
     speaks = both.score - fitted(f, ()).score
-    assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks and _needed(f, both, 2) == needed
+    assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks
+    assert (_certainty(f, (0, 2), 2) > 0) == needed
+
+
+def test_of_two_causes_that_can_spare_each_other_one_is_needed():
+    gap = gap_of({0: 4.0, 2: 4.0})
+    other = linear(
+        "d",
+        gap.candidates[2].jacobian + 0.1 * np.random.default_rng(0).standard_normal((gap.residual.size, 1)),
+    )
+    f = forms(replace(gap, candidates=(gap.candidates[0], gap.candidates[2], other)))
+    found = _examined(f, (0, 1, 2), search.sought(f), np.ones(f.count.size), np.random.default_rng(0))
+    assert _certainty(f, (0, 1, 2), 1) < 0 and _certainty(f, (0, 1, 2), 2) < 0 and found.causes == (0, 1)
 
 
 def test_a_cause_has_the_parameters_that_it_has_without_what_its_set_can_spare():
