@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.rows import Rows, rows_of
-from simgap.robots.windows import FLIES, LENGTH, RESTS, STRIKES, Window, cut, start_of
-from simgap.simulators.protocol import Channels, Job, Simulator, run_all
+from simgap.robots.windows import DOUBT, FLIES, LENGTH, RESTS, STRIKES, Window, cut, smoothed, start_of
+from simgap.simulators.protocol import RATE, Channels, Job, Simulator, run_all
 from simgap.simulators.recording import Recording
 from simgap.simulators.user import restarts
 
@@ -63,7 +63,24 @@ class Composed:
         windows = tuple(cut(simulator, recordings, noise, length))
         rows = rows_of(recordings, windows, noise)
         motion = () if restarts(simulator) else tuple(motions(simulator, recordings))
-        return cls(simulator, tuple(recordings), windows, effects, noise, rows, motion=motion)
+        made = cls(simulator, tuple(recordings), windows, effects, noise, rows, motion=motion)
+        read = restarts(simulator) and getattr(simulator, "state_at", None) is None
+        return replace(made, windows=tuple(made._doubted())) if read else made
+
+    def _doubted(self) -> Iterator[Window]:
+        """The windows, with rates of starts in doubt by what curves through samples miss of the model's own.
+
+        Where commands jump at every sample a stiff drive's rate swings between samples, always alike: at them
+        it is another than that of any curve through them.
+        """
+        runs = self._rolled({}, self.windows, [w.start for w in self.windows])
+        for w, run in zip(self.windows, runs, strict=True):
+            t, doubt, start = self.recordings[w.log].t[w.first : w.end], dict(w.doubt), w.start or {}
+            for name, values in (run or {}).items():
+                if (state := name + RATE) in doubt:
+                    _, (rate, _) = smoothed(t, values, 0, self.noise[name], forward=True)
+                    doubt[state] = float(np.hypot(doubt[state], DOUBT * (rate - start[state])))
+            yield replace(w, doubt=doubt)
 
     def calm(self) -> Composed:
         """The same without windows of bodies that move in contact, unless some log has no others."""
