@@ -5,24 +5,27 @@ export OPENBLAS_NUM_THREADS ?= 1
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: oldest newest golden robots-check robots-given bench-robot sequences robots-models bench-long gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs gap-fresh
+.PHONY: oldest golden robots-check robots-given bench-robot sequences robots-models bench-long gap-results blind-check real wrist readme-figures bench bench-haptic bench-watch help setup demo test lint typecheck tests slow wheel docs constants results paper check-gap calibrate fuzz gap-labs gap-fresh
 
 help:  ## show this list
 	@sed -n 's/^\([a-z-]*\):.*##/\1\t/p' $(MAKEFILE_LIST) | expand -t 12
 
 setup: $(INSTALLED)  ## make .venv with the project and its tools in it
 
+$(BIN)/python:
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "Python >= 3.11 is needed")'
+	$(PYTHON) -m venv .venv
+
 # The demo needs the package alone, not the tools of its developers.
 PACKAGE := .venv/.package
-$(PACKAGE): pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "Python >= 3.11 is needed")'
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+$(PACKAGE): pyproject.toml | $(BIN)/python
 	test -e $(INSTALLED) || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
-$(INSTALLED): $(PACKAGE)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
-	touch $@
+$(INSTALLED): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[dev]'
+	touch $(PACKAGE) $@
 
 demo: $(PACKAGE)  ## identify and diagnose the recording that comes along; figures in demo/
 	$(BIN)/hmmseg demo --figures demo
@@ -45,28 +48,19 @@ slow: $(INSTALLED)  ## the tests marked slow, and every call's annotations check
 golden: $(INSTALLED)  ## verdicts, boundaries and properties of recordings/ against those pinned in tests/data/golden
 	$(BIN)/python -m experiments.golden compare
 
-wheel: $(INSTALLED)  ## build sdist and wheel, install in an empty environment, use it outside the repository
-	$(BIN)/python .ci/check_wheel.py
-
 # Both ends of what pyproject.toml declares, each in an environment of its own; ArviZ 1 needs Python 3.12,
 # which NEWEST_PYTHON can name.
 NEWEST_PYTHON ?= $(BIN)/python
-oldest: $(BIN)/uv  ## the demo and the file formats with the oldest versions that pyproject.toml declares
-	$(call at_versions,oldest,$(BIN)/python,--resolution lowest-direct)
+wheel: $(INSTALLED)  ## build sdist and wheel, use it outside the repository with the newest versions there are
+	$(BIN)/python .ci/check_wheel.py --python $(NEWEST_PYTHON)
 
-newest: $(BIN)/uv  ## the demo and the file formats with the newest versions there are
-	$(call at_versions,newest,$(NEWEST_PYTHON),--upgrade)
-
-$(BIN)/uv: $(INSTALLED)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-
-define at_versions
-	$(BIN)/uv venv --quiet --clear --python $(2) build/$(1)
-	$(BIN)/uv pip install --quiet --python build/$(1) $(3) '.[mujoco,files]' 'pytest>=8'
-	build/$(1)/bin/hmmseg doctor
-	build/$(1)/bin/hmmseg demo --quiet --figures build/$(1)_demo
-	build/$(1)/bin/python -m pytest -q -W default -p no:cacheprovider tests/hmmseg/test_formats.py
-endef
+OLDEST := build/oldest
+oldest: $(INSTALLED)  ## the demo and the file formats with the oldest versions that pyproject.toml declares
+	$(BIN)/uv venv --quiet --clear --python $(BIN)/python $(OLDEST)
+	$(BIN)/uv pip install --quiet --python $(OLDEST) --resolution lowest-direct '.[mujoco,files]' 'pytest>=8'
+	$(OLDEST)/bin/hmmseg doctor
+	$(OLDEST)/bin/hmmseg demo --quiet --figures build/oldest_demo
+	$(OLDEST)/bin/python -m pytest -q -W default -p no:cacheprovider tests/hmmseg/test_formats.py
 
 docs: $(INSTALLED)  ## the documentation site, in build/docs; warnings are errors
 	$(BIN)/sphinx-build -q -E -W --keep-going -b html docs build/docs

@@ -1,10 +1,10 @@
 """Build sdist and wheel, install the wheel in an empty environment, and use it outside this repository.
 
-    python .ci/check_wheel.py [--folder DIR] [--no-demo]
+    python .ci/check_wheel.py [--python PYTHON]
 
-In an environment that holds nothing but the wheel and what it declares, the three imports of the README,
-the version beside another project's commands.py, shell completion and the demo must work; JAX must stay as
-it was.
+In an environment that holds nothing but the wheel and the newest versions of what it declares, the three
+imports of the README, the version beside another project's commands.py, shell completion and the demo must
+work; JAX must stay as it was. With the newest versions of its extras, so must the file formats.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-import venv
 import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"hmmseg", "estimation", "simgap", "hmmseg_cli"}
+FORMATS = ("-q", "-W", "default", "-p", "no:cacheprovider", "tests/hmmseg/test_formats.py")
 IMPORTS = """
 import jax
 before = dict(jax.config.values)
@@ -59,13 +59,14 @@ def build(folder: Path) -> Path:
     return wheel
 
 
-def check(wheel: Path, folder: Path, demo: bool) -> None:
+def check(wheel: Path, folder: Path, python: str) -> None:
     """Everything a stranger does first, in an environment of its own."""
-    home = folder / "environment"
-    venv.create(home, with_pip=True)
+    home, uv = folder / "environment", Path(sys.executable).with_name("uv")
+    run(uv, "venv", "--quiet", "--python", python, home, cwd=ROOT)
     binaries = home / ("Scripts" if os.name == "nt" else "bin")
     python, hmmseg = binaries / "python", binaries / "hmmseg"
-    run(python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", wheel, cwd=folder)
+    install = uv, "pip", "install", "--quiet", "--upgrade", "--python", python
+    run(*install, wheel, cwd=folder)
     away = folder / "away"
     away.mkdir()
     (away / "commands.py").write_text("raise ImportError('a commands.py of another project')\n")
@@ -73,24 +74,23 @@ def check(wheel: Path, folder: Path, demo: bool) -> None:
     run(python, "-c", IMPORTS, cwd=away)
     said = run(hmmseg, cwd=away, _HMMSEG_COMPLETE="complete_bash", COMP_WORDS="hmmseg ide", COMP_CWORD="1")
     assert said.split() == ["identify"], said
-    if demo:
-        run(hmmseg, "demo", "--quiet", "--json", "demo.json", cwd=away)
-        found = json.loads((away / "demo.json").read_text())
-        weights = [entry["weight"]["mean"] for entry in found["properties"].values()]
-        shown = ", ".join(f"{weight:.3f} N" for weight in weights)
-        print(f"demo: weights {shown}; verdict {found['diagnosis']['verdict']}")
+    run(hmmseg, "demo", "--quiet", "--json", "demo.json", cwd=away)
+    found = json.loads((away / "demo.json").read_text())
+    weights = [entry["weight"]["mean"] for entry in found["properties"].values()]
+    shown = ", ".join(f"{weight:.3f} N" for weight in weights)
+    print(f"demo: weights {shown}; verdict {found['diagnosis']['verdict']}")
+    run(*install, f"{wheel}[mujoco,files]", "pytest>=8", cwd=folder)
+    print(run(hmmseg, "doctor", cwd=away))
+    print(run(python, "-m", "pytest", *FORMATS, cwd=ROOT))
 
 
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--folder", type=Path, help="work here and leave it (else a temporary one)")
-    parser.add_argument("--no-demo", action="store_true")
+    parser.add_argument("--python", default=sys.executable, help="of the environment")
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = (args.folder or Path(temporary)).resolve()
-        folder.mkdir(parents=True, exist_ok=True)
-        check(build(folder), folder, not args.no_demo)
+    with tempfile.TemporaryDirectory() as folder:
+        check(build(Path(folder)), Path(folder), args.python)
     print("the wheel works outside the repository")
 
 
