@@ -220,9 +220,11 @@ def identified():
 
 
 SINGLE = """
-import os
-os.environ.pop("JAX_ENABLE_X64", None)
 import jax
+from hmmseg.jaxconfig import configure, keep_programs
+configure()
+keep_programs()  # else all are compiled anew
+jax.config.update("jax_enable_x64", False)
 from estimation import identify
 from hmmseg import Task, align
 from simgap import VirtualModel, simulate

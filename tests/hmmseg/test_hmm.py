@@ -61,9 +61,10 @@ def assert_drawn(counts, expected):
 @pytest.mark.parametrize("num_skips", [0, 1])
 def test_draws_have_the_exact_path_probabilities(num_skips):
     # Transitions vary strongly in time: a sampler off by one in t fails by a wide margin.
-    ll, bands = random_problem(5, 3, seed=11, num_skips=num_skips)
+    num_states = 3 + num_skips
+    ll, bands = random_problem(5, num_states, seed=11, num_skips=num_skips)
     bands = tuple(2.0 * band for band in bands)
-    ends = {"initial": np.array([0.0, 0.5, -1.0]), "final": np.array([-1.0, 0.5, 0.0])}
+    ends = {"initial": np.linspace(0.5, -1.0, num_states), "final": np.linspace(-1.0, 0.5, num_states)}
     paths, weights, log_evidence, *_ = brute(ll, bands, **ends)
     chain = chain_of(bands, log_initial=ends["initial"], log_final=ends["final"])
     drawn = np.array([a.path for a in hmm.sample(ll, chain, 20_000, seed=5)])
@@ -87,7 +88,7 @@ def test_intervals_of_boundaries_match_enumeration():
 @pytest.mark.parametrize(("num_states", "num_skips", "varying"), [(1, 0, False), (4, 0, True), (5, 1, False)])
 def test_in_parallel_in_time_is_the_same(num_states, num_skips, varying):
     rng = np.random.default_rng(num_states)
-    n = 130  # more take longer to compile
+    n = 128  # more take longer to compile
     ll = 5 * rng.normal(size=(n, num_states))
     ll[40:60] = np.nan
     ll[100:120, : num_states // 3] = -np.inf
@@ -134,7 +135,7 @@ def test_missing_samples_are_no_evidence_and_nothing_underflows_or_overflows():
 def test_recordings_of_many_lengths_equal_one_by_one(single):
     rng = np.random.default_rng(2)
     kind = np.float32 if single else np.float64
-    trials = [rng.normal(size=(n, 4)).astype(kind) for n in (4, 9, 300, 7, 5000)]
+    trials = [rng.normal(size=(n, 4)).astype(kind) for n in (4, 9, 7, 5000)]
     chain = hmm.left_to_right([20.0, 5.0, 30.0, 10.0])
     for each, trial in zip(align(trials, [chain] * len(trials)), trials, strict=True):
         alone = hmm.viterbi(trial, chain)
@@ -209,17 +210,17 @@ def test_refusals(make, message):
 @pytest.mark.parametrize("function", ["viterbi", "smooth", "filter", "log_evidence", "k_best", "sample"])
 @pytest.mark.parametrize("num_skips", [0, 1])
 def test_infeasible_alignments_say_which_subtask_starves(function, num_skips):
-    ll, bands = random_problem(6, 3, seed=1, num_skips=num_skips)
+    ll, bands = random_problem(6, 3 + num_skips, seed=1, num_skips=num_skips)
     for band in bands[2:]:
         band[:] = -np.inf
     starved, dead_end = ll.copy(), ll.copy()
     starved[:, 1] = -np.inf
-    dead_end[5, 2] = -np.inf
+    dead_end[5, -1] = -np.inf
     for table, subtask, reason in [(starved, 1, "no sample is possible under it"),
-                                   (dead_end, 2, "cannot be held to the end")]:  # fmt: skip
+                                   (dead_end, 2 + num_skips, "cannot be held to the end")]:  # fmt: skip
         with pytest.raises(hmm.InfeasibleAlignment, match=reason) as caught:
             getattr(hmm, function)(table, chain_of(bands),
-                                   *{"k_best": (3,), "sample": (3,)}.get(function, ()))  # fmt: skip
+                                   *{"k_best": (7,), "sample": (20_000,)}.get(function, ()))  # fmt: skip
         assert caught.value.subtask == subtask
 
 
@@ -354,8 +355,7 @@ def crossing(moves, num_states):
     return out
 
 
-@pytest.mark.parametrize("num_skips", [0, 1])
-@pytest.mark.parametrize("lag", [0, 3, 20])
+@pytest.mark.parametrize(("lag", "num_skips"), [(0, 1), (3, 0), (3, 1), (20, 0)])
 def test_every_step_matches_enumeration(lag, num_skips):
     rng = np.random.default_rng(0)
     rows = [rng.normal(size=max(3 - d, 0)) - d for d in range(2 + num_skips)]
@@ -469,7 +469,7 @@ def lasting_problem(num_rows, num_states, seed):
 
 @pytest.mark.parametrize("open_end", [False, True])
 @pytest.mark.parametrize("optional", [False, True])
-@pytest.mark.parametrize("size", [(1, 1), (6, 2), (8, 3), (7, 4)])
+@pytest.mark.parametrize("size", [(1, 1), (8, 3), (7, 4)])
 def test_every_quantity_matches_enumeration_of_durations(size, optional, open_end):
     for seed in range(20):  # the first random tables that allow any path
         ll, durations = lasting_problem(*size, seed=sum(size) + 100 * seed)

@@ -234,20 +234,38 @@ def test_values_of_against_reach_up_to_the_next_option(folder, monkeypatch):
     assert once == taken and len(once["sim"]) == len(once["real"]) == 5
 
 
-def test_columns_of_a_plain_task_are_those_that_the_rig_maps(folder, tmp_path):
+@pytest.fixture
+def read(monkeypatch):
+    """The trials that a command has read, which then stops."""
+    trials = []
+
+    def stop(real, simulated, *_):
+        trials.extend([*real, *simulated])
+        raise InputError("test", "has seen enough")
+
+    for name in ("align", "align_block_trials"):
+        monkeypatch.setattr(f"simgap.generic.trials.{name}", stop)
+    return trials
+
+
+def test_columns_of_a_plain_task_are_those_that_the_rig_maps(folder, read):
+    expected = pd.read_csv(folder / "sim_04.csv")
     for path in [*folder.glob("real_*.csv"), *folder.glob("sim_*.csv")]:
         pd.read_csv(path).rename(columns={"t": "stamp"}).to_csv(path, index=False)
     (folder / "columns.toml").write_text('[columns]\nt = {from = "stamp"}\n')
-    args = ["--rig", str(folder / "columns.toml"), "--json", str(tmp_path / "out.json"), "--quiet"]
-    assert main(arguments(folder, *args)) == 0
-    assert json.loads((tmp_path / "out.json").read_text())["causes"] == ["force_bias"]
+    assert main(arguments(folder, "--rig", str(folder / "columns.toml"))) == 2
+    assert len(read) == 10 and all(sorted(trial.channels) == ["fa", "fb"] for trial in read)
+    np.testing.assert_allclose(read[-1].t, expected.t, atol=1e-9)
+    np.testing.assert_allclose(read[-1].channels["fa"], expected.fa)
 
 
 def test_plain_tasks_need_simulated_trials_and_settled_boundaries(folder, tmp_path, capsys):
     (folder / "task.toml").write_text('sequence = ["approach", "press"]\n')  # one of two changes
     out = tmp_path / "out.json"
     assert main(arguments(folder, "--json", str(out), "--quiet")) == 0
-    assert any("as well be elsewhere" in line for line in json.loads(out.read_text())["warnings"])
+    document = json.loads(out.read_text())
+    assert document["causes"] == ["force_bias"]
+    assert any("as well be elsewhere" in line for line in document["warnings"])
     args = arguments(folder)
     assert main(args[: args.index("--against")]) == 2
     line = capsys.readouterr().err
@@ -265,18 +283,12 @@ def test_what_does_not_go_with_given_trials_is_refused(folder, capsys, monkeypat
     assert main(arguments(folder, *more)) == 2 and line in capsys.readouterr().err
 
 
-def test_trials_as_simulate_writes_them_go_with_recordings_of_other_columns(tmp_path, monkeypatch):
-    example, read = example_folder(), []
+def test_trials_as_simulate_writes_them_go_with_recordings_of_other_columns(tmp_path, read):
+    example = example_folder()
     clock = '\n[columns]\nt = {from = "stamp", unit = "ms"}\n'
     (tmp_path / "rig.toml").write_text((example / "rig.toml").read_text() + clock)
     table = pd.read_csv(example / "trial_01.csv").rename(columns={"t": "stamp"})
     table.assign(stamp=1000 * table.stamp).to_csv(tmp_path / "real.csv", index=False)
-
-    def stop(real, simulated, *_):
-        read.extend([*real, *simulated])
-        raise InputError("test", "has seen enough")
-
-    monkeypatch.setattr("simgap.generic.trials.align_block_trials", stop)
     args = ["--task", str(example / "task.toml"), "--rig", str(tmp_path / "rig.toml"), "--against"]
     assert main(["diagnose", str(tmp_path / "real.csv"), *args, str(example / "trial_01.csv")]) == 2
     real, simulated = read
