@@ -41,7 +41,7 @@ class DurationChain(Leaves):
         ValueError: wrong shapes, NaN, +inf, or a state without a possible duration.
     """
 
-    varying, num_samples = False, None  # as of a Chain whose weights do not change in time
+    num_samples = None  # as of a Chain whose weights do not change in time
     leaves = ("pmf", "survival", "jumps", "log_initial", "log_final")
     pmf: np.ndarray  # (num_states, longest): log probability of lasting n samples in column n - 1
     survival: np.ndarray  # the same for a state that the recording's end cuts off
