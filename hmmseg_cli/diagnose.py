@@ -157,10 +157,12 @@ def _against(
 ) -> None:  # fmt: skip
     """Diagnose the gap to given simulated trials."""
     from hmmseg.sequence.model import load_model
+    from simgap.generic.diagnose import check_forced
     from simgap.generic.diagnose import diagnose as compare
     from simgap.generic.effects import effects
     from simgap.generic.trials import align, align_block_trials
 
+    check_forced(effect)
     every, count = distinct_trials([*paths, *against]), len(paths)
     if isinstance(task, BlockTask):
         refuse("goes only with a plain ordered task", {"--model": model_file})

@@ -68,6 +68,14 @@ class GenericDiagnosis:
     warnings: tuple[str, ...]
 
 
+def check_forced(names: Sequence[str]) -> None:
+    """InputError for an effect that given trials cannot show."""
+    for name in names:
+        if name not in effects():
+            raise InputError(f"effect {name!r}", "needs the virtual model or is unknown",
+                             nearest(name, list(effects())))  # fmt: skip
+
+
 def diagnose(
     ensembles: Ensembles, forced: Sequence[str] = (), seed: int = 0, tell: Progress = silent
 ) -> GenericDiagnosis:
@@ -85,10 +93,7 @@ def diagnose(
     Raises:
         InputError: A forced effect is unknown, or needs the virtual model.
     """
-    for name in forced:
-        if name not in effects():
-            raise InputError(f"effect {name!r}", "needs the virtual model or is unknown",
-                             nearest(name, list(effects())))  # fmt: skip
+    check_forced(forced)
     lay = layout(ensembles)
     real, sim = both(lay)
     given = scene(lay, find_ring(lay))
