@@ -73,7 +73,6 @@ def test_fingers_carry_the_weight_and_pads_are_linear_and_do_not_slip(motion):
     np.testing.assert_allclose(net, 0.5 * (1 + a / RIG.gravity), atol=0.01)
     free = (motion.t < touch - 0.02) | ((motion.t > part + 0.1) & (motion.t < motion.boundaries[4] - 0.02))
     assert np.abs(motion.force[free]).max() < 1e-4
-    touch, _, _, part = motion.boundaries[:4]
     held = (motion.t > touch + 0.1) & (motion.t < part - 0.1)
     p, f = motion.position[held], motion.force[held]
     distance = p[:, 2] - p[:, 0] + (f[:, 0] - f[:, 2]) / RIG.normal_stiffness
@@ -92,10 +91,9 @@ def test_worlds_are_drawn_apart_and_noise_is_as_the_rig_says_or_as_drawn(motion)
     drawn = [draw_world(np.random.default_rng(k)) for k in range(40)]
     assert {w.profile for w in drawn} == {"minimum_jerk", "trapezoid", "person"}
     assert len({w.task for w in drawn}) >= 4 and min(w.pace for w in drawn) < 0.6
-    signals, rng = sense(motion, RIG, [], np.random.default_rng(0)), lambda: np.random.default_rng(1)
     odd = Sampling(noise=(1.0, 1.0, 1.3), colour=0.3, differences=True)
-    _, noisy = sample(signals, odd, rng())
-    _, quiet = sample(signals, odd, rng(), noisy=False)
+    _, noisy = sample(signals, odd, np.random.default_rng(1))
+    _, quiet = sample(signals, odd, np.random.default_rng(1), noisy=False)
     e = np.concatenate([noisy[c] - quiet[c] for c in ("fx1", "fy1", "fx2", "fy2")])
     assert np.std(e) == pytest.approx(1.3 * RIG.force_noise, rel=0.1)
     assert np.corrcoef(e[1:], e[:-1])[0, 1] == pytest.approx(0.3, abs=0.1)

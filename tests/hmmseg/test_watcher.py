@@ -98,7 +98,7 @@ def test_emissions_are_those_off_line():
 
 
 def test_answers_of_a_watched_task_agree_with_those_off_line_and_tighten(watched):
-    _, lines, final = watched
+    watcher, lines, final = watched
     assert len(lines) == 200
     wanted = {"t", "subtask", "object", "state", "probabilities", "next", "properties", "fits"}
     for line in lines:
@@ -106,7 +106,6 @@ def test_answers_of_a_watched_task_agree_with_those_off_line_and_tighten(watched
         assert sum(line["probabilities"]) + line["departed"] == pytest.approx(1, abs=1e-5) and line["fits"]
     assert lines[0]["subtask"] == "pregrasp" and lines[0]["next"]["subtask"] == "pickup"
     assert lines[-1]["next"] is None and final["final"] is True and final["fits"]
-    watcher, _, final = watched
     trial = Trial.read(CASE / "trial_01.csv", RIG)
     off_line = segment([trial], Task.read(TASK), Rig.read(RIG))[0].spans
     assert [c.step.name for c in watcher.crossings] == [s.subtask for s in off_line[1:]]
@@ -117,7 +116,6 @@ def test_answers_of_a_watched_task_agree_with_those_off_line_and_tighten(watched
     assert blocks["block1"]["weight"]["mean"] == pytest.approx(0.343, abs=0.02)
     assert blocks["block2"]["width"]["mean"] == pytest.approx(0.0254, abs=2e-4)
     assert blocks["block1"]["height"]["mean"] == pytest.approx(0.016, abs=2e-4)
-    _, lines, _ = watched
     sds = [line["properties"]["block1"]["weight"]["sd"] for line in lines
            if "weight" in line["properties"].get("block1", {}) and 2.5 < line["t"] < 3.7]  # fmt: skip
     assert sds[-1] < 0.7 * sds[0]

@@ -95,10 +95,8 @@ def test_what_a_task_cannot_tell_or_does_not_name_is_said(tmp_path):
     assert found["trials"][0]["complete"] and found["warnings"] == []
     assert found["properties"]["block1"]["height"] is None and found["reasons"]["block1.height"]
     assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.343, rel=0.03)
-    task, trial = tmp_path / "task.toml", tmp_path / "trial.csv"
-    task.write_text(SINGLE)  # but the recorded block comes down from another, 12.5 mm
-    cut = pd.read_csv(NONE / "trial_01.csv")
-    cut[cut.t < 5.5].to_csv(trial, index=False)
+    trial, cut = tmp_path / "trial.csv", pd.read_csv(NONE / "trial_01.csv")
+    cut[cut.t < 5.5].to_csv(trial, index=False)  # the block comes down from another, 12.5 mm
     found = document("identify", str(trial), "--task", str(task), "--rig", str(NONE / "rig.toml"),
                      out=tmp_path / "o.json")  # fmt: skip
     assert found["properties"]["block1"]["weight"]["mean"] == pytest.approx(0.57789, rel=0.03)
@@ -197,7 +195,6 @@ def test_the_papers_equation_1_and_its_document(decomposed):
     (row,) = (line for line in printed.splitlines() if "│ carry block1" in line)
     cells = [cell.strip() for cell in row.split("│")]
     assert cells[3:7] == ["hold-above-ground", "vertical", "horizontal", ""]
-    document, _ = decomposed(PAPER)
     assert document["minimal"] == list(range(9))
     assert document["height_equations"] == [{"move": 1, "rise": {"block2": -1}},
                                             {"move": 2, "rise": {"block1": 1}}]  # fmt: skip

@@ -150,7 +150,6 @@ def test_what_is_nearest_to_the_recorded_number_is_put_in_last_and_taken_out_fir
     off = np.abs(contact(world) - world_of(truth).force)[:, 3:-15]
     put_in = np.abs(world_of(late).force - world_of(truth).force)[:, 3:-15]
     assert off.max() < 0.1 * put_in.max()
-    truth = performance()
     gain, bias = catalogue()["force_gain"], catalogue()["force_bias"]
     values = dict.fromkeys(("fx1", "fy1", "fx2", "fy2"), 0.1)
     recorded = bias.apply(gain.apply(truth, {"gain": 0.5}, RNG), values, RNG)

@@ -53,12 +53,10 @@ def healthy():
 
 
 def test_a_healthy_recording_is_noise_without_quantisation(healthy):
-    _, found = healthy
-    assert 0.7 < np.mean(found.residual**2) < 1.15
     given, found = healthy
+    assert 0.7 < np.mean(found.residual**2) < 1.15
     scaled = fit(given, ("force_gain",), neutral(given))
     assert found.cost - scaled.cost < 8
-    given, found = healthy
     assert not scatters(given, found.residual, ["quantisation"])
     finish = effect_named("quantisation").finish
     rounded = tuple(finish(force, {"step": 0.04}) for force in given.frame.forces)

@@ -58,6 +58,7 @@ def test_blocks_are_those_that_were_recorded_and_lost_readings_are_left_out(quic
     left = without_dropouts(replace(quick.trial, channels=channels))
     for c in FORCES:
         assert (np.flatnonzero(np.isnan(left.channels[c])) == inside).all()
+    assert np.isfinite(left.channels["q11"]).all()
     assert without_dropouts(quick.trial) is quick.trial  # no touch and no release is taken for one
 
 

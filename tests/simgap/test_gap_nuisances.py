@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from demo_recordings import recorded
 
-from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align
 from simgap.attribution.posterior import fitted, forms, of_noise, products
 from simgap.attribution.problem import Candidate, Gap, Rows, cosines, spectrum
@@ -15,7 +14,7 @@ from simgap.effects.base import gradient, swung, tips
 from simgap.gap import assemble
 from simgap.gap.assemble import SIZES, _density, _likeliest, carried, gap_of, on_other, redrawn, with_noise
 from simgap.gap.assemble import _turning as turned_variance
-from simgap.gap.frame import CHANNELS, OFFSET, _one_finger, build, without_dropouts
+from simgap.gap.frame import CHANNELS, OFFSET, _one_finger, build
 from simgap.gap.nuisances import BEYOND, _inertial, _late_rates, _settling, with_nuisances
 from simgap.gap.problem import Nuisances, fit, neutral, problem
 from simgap.gap.residuals import _misread_moment, residuals, turned
@@ -297,18 +296,11 @@ def test_which_measured_properties_show_does_not_depend_on_the_noise_redrawn(mar
     assert len(names) == (marginal.sd.size if shown > 1 else 0)
 
 
-def test_what_is_lost_or_does_not_act_in_proportion_is_missing():
+def test_what_does_not_act_in_proportion_is_missing():
     force = np.array([[0.5], [-0.9], [3.0]])
     contact = lambda step: np.maximum(force + step, 0.0)  # noqa: E731 - noise makes the second contact, at full size
     noise = carried(contact(0.0), SIZES * 2, contact)
     np.testing.assert_allclose(np.square(noise[..., 0]).sum(0), [1.0, 0.0, 1.0], rtol=1e-6)
-    t = np.arange(12) / 100
-    grip = np.array([0, 0, 2.0, 2.1, 0.01, 2.0, 2.0, 0, 0, 0.5, 0, 3.0])
-    channels = {"fx1": grip, "fy1": 0.2 * grip, "fx2": -grip, "fy2": 0.2 * grip, "x1": t}
-    found = without_dropouts(Trial("trial.csv", t, channels))
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.channels["fx1"])), [4])
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found.channels["fy2"])), [4])
-    np.testing.assert_array_equal(found.channels["x1"], t)
 
 
 @pytest.mark.parametrize("size", [0.3, 1.5, 8.0, 20.0])
