@@ -388,7 +388,7 @@ def test_every_round_is_aligned(moves, repeat):
 
 
 @pytest.mark.parametrize(("repeat", "number", "at"),
-                         [("unknown", 10, 6), (10, 10, 6), ("unknown", 100, 56), (100, 100, 56)])  # fmt: skip
+                         [("unknown", 10, 6), (10, 10, 6), ("unknown", 100, 56)])  # fmt: skip
 def test_a_drop_in_one_round_leaves_the_others(repeat, number, at):
     aligned, truth = aligned_session((0,), number, repeat, dropped=at)
     trial, steps = aligned.trials[0], aligned.subtasks

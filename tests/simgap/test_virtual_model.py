@@ -235,12 +235,12 @@ def test_energy_is_kept_by_an_undamped_bounce_and_never_made_by_contact():
     constants, spread = scene(support_damping=0.0), []
     for h in (1e-4, 5e-5, 2.5e-5):
         path = evolve(constants, at(constants, (0.0, 0.0085)), FAR, h, round(2.0 / h))
-        held = jax.vmap(lambda s: energy(constants, s, FAR))(path)
+        held = jax.jit(jax.vmap(lambda s: energy(constants, s, FAR)))(path)
         spread.append(float(jnp.ptp(held)) / (0.4 * 0.0005))  # over a hundred bounces
     assert spread[0] < 0.05 and spread[1] < spread[0] / 3 and spread[2] < spread[1] / 3
     constants = scene([Block(0.4, 0.02, 0.016), Block(0.3, 0.025, 0.012)])
     path = evolve(constants, at(constants, (0.0, 0.035), (0.004, 0.0065)), FAR, 5e-5, 20000)
-    held = np.asarray(jax.vmap(lambda s: energy(constants, s, FAR))(path))
+    held = np.asarray(jax.jit(jax.vmap(lambda s: energy(constants, s, FAR)))(path))
     lost = held[0] - held[-1]
     assert lost > 0.4 * 0.014  # the upper block fell that far and rests
     # Within an impact the scheme's energy swings by the square of the step; none is left over.
@@ -312,7 +312,7 @@ def test_gradients_through_contact_agree_with_differences_and_are_finite_at_touc
         _, loads = interact(constants._replace(weight=(weight,)), state, fingers)
         return loads.fx[0] + loads.block_y[0]
 
-    for value in jax.grad(total, argnums=(0, 1))(jnp.asarray(0.4), jnp.asarray(0.01)):
+    for value in jax.jit(jax.grad(total, argnums=(0, 1)))(jnp.asarray(0.4), jnp.asarray(0.01)):
         assert np.isfinite(value)
 
 
