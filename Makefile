@@ -96,8 +96,8 @@ FRESH := experiments/results/gap_fresh.json
 DRAWN := $(BIN)/python -m experiments.gap_drawn --results build/gap_fresh --output $(FRESH)
 gap-fresh: $(INSTALLED)  ## diagnoses of labs of our own second simulator, drawn anew; fills docs/gap_results.md
 	set -e; open() { $(BIN)/python -m experiments.blind_check open --seed $$1 --cases $$2 --out build/$$1 --tiers $$3; }; \
-	  open 273001 20 healthy; open 273011 40 "single pair outside"
-	$(DRAWN) build/273001 build/273011 --run "judged once"
+	  open 273101 20 healthy; open 273111 40 "single pair outside"
+	$(DRAWN) build/273101 build/273111 --run "judged once"
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
@@ -136,7 +136,7 @@ robots-models: $(INSTALLED)  ## models of robots by others out of packages, in b
 	cd $(ROBOTS) && for wheel in *.whl; do ../../$(BIN)/python -m zipfile -e $$wheel .; done
 
 robots-check: robots-models  ## seeded faults in these models, diagnosed (in build/robots_check; resumable) and scored; fills docs/robots_results.md
-	$(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 58210313 --cases 40 --robots pendulum reacher acrobot --out build/robots_check
+	$(BIN)/python -m experiments.robots_check $(ROBOTS) --seed 58210414 --cases 40 --robots pendulum reacher acrobot --out build/robots_check
 	$(BIN)/python -m experiments.robots_check $(ROBOTS) --score build/robots_check
 	$(BIN)/python -m experiments.write_tables
 
