@@ -162,8 +162,8 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
 
     A recorded angle that moves pins its joint to the side it moves towards. At rest the joint goes from one
     pin to the next: as its speed says, unless speeds are `unseen`; then the time is unknown, and from any
-    sample to the next it may have gone anywhere in the band. A band too narrow for motion to be detected has
-    no effect.
+    sample to the next it may have gone anywhere in the band, and never farther. A band too narrow for motion
+    to be detected has no effect.
     """
     band = half * np.clip(2 * half / (SHOWN * _noise(world.joints)[:, None]) - 1, 0.0, 1.0)
     moves, calm = _moves(world.joints)
@@ -195,8 +195,8 @@ def within(world: World, half: float, unseen: float) -> DeadBand:
     return DeadBand(
         place,
         (last == following) & (rest == 1) & (far > SHOWN * _noise(world.joints)[:, None]),
-        (1 - unseen) * np.diff(own, axis=1, prepend=own[:, :1]),
-        np.broadcast_to((1 - unseen) * seen, place.shape),
+        (1 - unseen) * np.clip(np.diff(own, axis=1, prepend=own[:, :1]), -2 * band, 2 * band),
+        np.broadcast_to((1 - unseen) * np.minimum(seen, np.square(band) * ANYWHERE), place.shape),
         np.square(unseen * band[:, 0]) * ANYWHERE,
     )
 

@@ -353,6 +353,8 @@ def test_a_joint_lies_where_it_was_pushed_to():
     band = within(world._replace(rates=rates[None]), half, 0.0)
     off = (((true - recorded) - band.place[0]) / half)[inner]
     assert np.sqrt(np.mean(off**2)) < 0.15 and not band.jump.any() and (band.wander > 0).all()
+    none = within(world._replace(rates=rates[None]), 1e-6, 0.0)
+    assert not (none.place.any() or none.drift.any() or none.wander.any())
 
 
 def test_joints_in_dead_bands_are_marginalised_exactly():
