@@ -28,9 +28,11 @@ except ImportError:  # untested versions of numba manage their files themselves
 
 HOME, SHARED = cache_folder(), (densities, levels, equations)
 if HOME is not None and not numba.config.CACHE_DIR:  # type: ignore[attr-defined]
-    # Numba detects changes of a function's own file only, so each state of these files has its own folder.
+    # Numba detects changes of a function's own file only, and its versions cannot read each other's files, so
+    # each state of these files has its own folder under each version.
     sources = [*Path(__file__).parent.glob("*.py"), *(Path(str(m.__file__)) for m in SHARED)]
-    state = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(sources))).hexdigest()[:16]
+    content = b"".join(path.read_bytes() for path in sorted(sources)) + numba.__version__.encode()
+    state = hashlib.sha256(content).hexdigest()[:16]
     keep(HOME / "numba" / state / "writable", b"")
     if kept(HOME / "numba" / state / "writable") is not None:
         numba.config.CACHE_DIR = str(HOME / "numba" / state)  # type: ignore[attr-defined]

@@ -386,3 +386,5 @@ def test_functions_are_kept_and_compiled_anew_where_they_are_damaged(tmp_path):
         content[len(content) // 2] ^= 0xFF
         file.write_bytes(content)
         assert run() == ("3.0 0", True) and run() == ("3.0 1", False)
+    program.write_text("import numba\nnumba.__version__ = 'another'\n" + FUNCTION)
+    assert run() == ("3.0 0", False) and len([*(tmp_path / "hmmseg/numba").iterdir()]) == 2
