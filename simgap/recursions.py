@@ -117,13 +117,13 @@ def tracked(
             best, chosen_mean, chosen_cov, seen, every = -np.inf, mean, cov, 0.0, -np.inf
             for r in range(choices):
                 m, p = (mean.copy(), cov.copy()) if choices > 1 else (mean, cov)
-                moves = choices == 1 or shares[r] > 0
                 for j in range(joints):
-                    if moves and k > 0 and not pinned[t, k, j]:
+                    if pinned[t, k, j]:
+                        continue
+                    if k > 0 and (choices == 1 or shares[r] > 0):
                         m[j] += drift[t, k, j]
                         p[j, j] += wander[t, k, j]
-                    if not pinned[t, k, j]:
-                        p[j, j] += shares[r] * jump[t, j]
+                    p[j, j] += shares[r] * jump[t, j]
                 score = np.log(chance[r]) if choices > 1 else 0.0
                 prior = score
                 misses, factors = np.zeros(4), np.ones(4)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import product
 
@@ -354,12 +354,9 @@ def _examined(
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
-    causes = effects
-    while certain := {j: _certainty(f, causes, j) for j in causes if j not in scattering}:
-        least = min(certain, key=lambda j: certain[j])
-        if certain[least] > 0:
-            break
-        causes = tuple(j for j in causes if j != least)
+    causes = _without_spared(
+        effects, lambda causes, j: np.inf if j in scattering else _certainty(f, causes, j)
+    )
     if others is not None:
         causes = _predicting(others, causes)
     share = 1 - explained.remainder
@@ -391,22 +388,31 @@ def _without_absurd(f: Forms, model: Model) -> tuple[int, ...]:
     return tuple(j for j in model.effects if j not in absurd)
 
 
+def _without_spared(
+    causes: tuple[int, ...], worth: Callable[[tuple[int, ...], int], float]
+) -> tuple[int, ...]:
+    """Drop causes whose worth to the others is not positive, one at a time: two may spare each other."""
+    while causes:
+        each = {j: worth(causes, j) for j in causes}
+        least = min(each, key=lambda j: each[j])
+        if each[least] > 0:
+            break
+        causes = tuple(j for j in causes if j != least)
+    return causes
+
+
 def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
-    """Drop causes without which held-out trials are predicted no worse, one at a time.
+    """Drop causes without which held-out trials are predicted no worse.
 
     The trial that gains most does not count: an accident of one trial is no cause.
     """
-    while causes:
-        gained = {}
-        for j in causes:
-            rest = [i for i in causes if i != j]
-            gains = others.gains(causes, rest, rest)
-            gained[j] = float(gains.sum() - gains[:-1].max())
-        least = min(gained, key=lambda j: gained[j])
-        if gained[least] > POSITIVE:
-            break
-        causes = tuple(i for i in causes if i != least)
-    return causes
+
+    def worth(causes: tuple[int, ...], effect: int) -> float:
+        rest = [j for j in causes if j != effect]
+        gains = others.gains(causes, rest, rest)
+        return float(gains.sum() - gains[:-1].max()) - POSITIVE
+
+    return _without_spared(causes, worth)
 
 
 def _certainty(f: Forms, effects: tuple[int, ...], effect: int) -> float:

@@ -111,6 +111,9 @@ def test_missing_samples_are_no_evidence_and_nothing_underflows_or_overflows():
     for chain in (chain_of(bands), chain_of((*bands, np.full((6, 1), -np.inf)))):
         assert hmm.viterbi(gone, chain).starts.tolist() == hmm.viterbi(empty, chain).starts.tolist()
         np.testing.assert_array_equal(hmm.smooth(gone, chain).smoothed, hmm.smooth(empty, chain).smoothed)
+        ll[5, 1] = np.nan
+        for function in (hmm.viterbi, hmm.smooth, hmm.log_evidence):
+            refused(r"log_likelihoods: NaN or \+inf at \[5, 1\]", function, ll, chain, error=ValueError)
     rng = np.random.default_rng(1)
     ll = rng.normal(size=(5000, 4))
     ll[rng.integers(0, 5000, 200), rng.integers(0, 4, 200)] = -1250.0  # samples fifty sigma away

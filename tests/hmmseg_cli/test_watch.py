@@ -185,7 +185,7 @@ def test_a_cluster_finds_the_same(lab, one):
 def test_bad_recordings_folders_and_plain_sequences_are_told_in_a_line(lab, capfd, tmp_path):
     (tmp_path / "bad.csv").write_text("t,x1\n0,1\n")
     arguments = ["--task", "task.toml", "--rig", "rig.toml", "--json", f"{tmp_path}/out.json"]
-    assert main(["segment", "many/0.csv", f"{tmp_path}/bad.csv", *arguments, "--workers", "1"]) == 2
+    assert main(["segment", "many/0.csv", f"{tmp_path}/bad.csv", *arguments, "--workers", "2"]) == 2
     assert "bad.csv: " in (said := capfd.readouterr().err) and said.count("\n") == 1
     assert not (tmp_path / "out.json").exists()
     (lab / "order.toml").write_text('sequence = ["approach", "press"]\n')

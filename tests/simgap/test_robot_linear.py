@@ -12,7 +12,7 @@ from hmmseg.io.task import SequenceTask, parse_task
 from simgap.channels import delayed, lowpass
 from simgap.robot_effects import candidates
 from simgap.robot_effects.base import Setting
-from simgap.robots.linear import linearise
+from simgap.robots.linear import base_at, linearise, vary
 from simgap.robots.model import Composed
 from simgap.robots.rows import estimate_noise, noises, phases_by_task, resolution, rows_of
 from simgap.robots.sets import identifiability
@@ -145,6 +145,16 @@ def test_a_planted_effect_is_what_its_sensitivity_says(effect, values):
     predicted = jacobian[effect] @ np.array([values[n] - p.nominal for n, p in made.parameters.items()])
     left = np.linalg.norm(shift - predicted) / np.linalg.norm(shift)
     assert np.linalg.norm(shift) > 2 and left < 0.1
+
+
+@pytest.mark.parametrize("name", ["readout:angle.gain", "readout:angle.bias", "readout:angle.lag"])
+def test_a_large_misreading_moves_starts_farther_than_along_straight_lines(name):
+    model = composed([log(3)])
+    base = base_at(model, {})
+    ((short, p),) = model.effects[name].parameters.items()
+    there = {short: p.nominal + 4 * p.sd}
+    one = vary(model, base, name, at=there)
+    np.testing.assert_allclose(one.shift, base_at(model, {name: there}).rows - base.rows, atol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "value"), [("lag", 0.02), ("lowpass", 0.03)])
