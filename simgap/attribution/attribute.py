@@ -354,9 +354,7 @@ def _examined(
     model = fitted(f, effects)
     explained = shares(f, model, by_group, rng)
     scattering = {j for j in effects if not f.gap.candidates[j].parameters}
-    causes = _without_spared(
-        effects, lambda causes, j: np.inf if j in scattering else _certainty(f, causes, j)
-    )
+    causes = _without_spared(effects, lambda causes, j: _certainty(f, causes, j))
     if others is not None:
         causes = _predicting(others, causes)
     share = 1 - explained.remainder
@@ -409,7 +407,7 @@ def _predicting(others: Heldout, causes: tuple[int, ...]) -> tuple[int, ...]:
 
     def worth(causes: tuple[int, ...], effect: int) -> float:
         rest = [j for j in causes if j != effect]
-        gains = others.gains(causes, rest, rest)
+        gains = others.gains(causes, rest)
         return float(gains.sum() - gains[:-1].max()) - POSITIVE
 
     return _without_spared(causes, worth)

@@ -95,15 +95,6 @@ def residual_left(f: Forms, model: Model) -> np.ndarray:
     return out
 
 
-def form_error(f: Forms, model: Model) -> np.ndarray:
-    """Mean square (G,) of the usual error in the forms of a set's effects, in units of the noise."""
-    out = np.zeros(f.count.size)
-    for j, mine in coordinates(f, model.effects).items():
-        own, x = f.spectrum.own[j], np.append(1.0, model.x[mine])
-        out += f.gap.candidates[j].form ** 2 * np.einsum("i,gij,j->g", x, f.product[:, own[:, None], own], x)
-    return np.maximum(out, 0.0) / f.count
-
-
 # How far causes shrink the gap of held-out trials, predicted from the other trials.
 #
 # Causes are chosen on all trials; their sizes are then estimated without the trial that is predicted. The
@@ -162,7 +153,7 @@ class Heldout:
     whole: Forms
     among: tuple[int, ...]
     folds: tuple[tuple[Forms, Forms], ...]
-    computed: dict[tuple[tuple[int, ...], ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    computed: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, whole: Forms, noise: np.ndarray, among: Iterable[int]) -> Heldout | None:
@@ -190,41 +181,38 @@ class Heldout:
         """Gain of the log predictive density of all trials [nats] by `effects` over the set `without`."""
         return float(self.gains(effects, without).sum())
 
-    def gains(self, effects: Sequence[int], without: Sequence[int], off: Sequence[int] = ()) -> np.ndarray:
+    def gains(self, effects: Sequence[int], without: Sequence[int]) -> np.ndarray:
         """Gain of the log predictive density [nats] by trial, and for what was measured apart.
 
         Args:
             effects: A set of candidates.
             without: The set it is compared with.
-            off: Effects whose forms are only as good as usual (`Candidate.form`).
 
         Returns:
             Gains (K + 1,), evidence from other sources included.
         """
-        (more, wide), (less, plain) = self._squares(effects, off), self._squares(without, off)
+        (more, wide), (less, plain) = self._squares(effects), self._squares(without)
         of = self.whole.gap.candidates
         evidence = sum(of[j].evidence for j in effects) - sum(of[j].evidence for j in without)
         gained = 0.5 * (less + plain - more - wide)
         return gained + evidence / len(self.folds) * (np.arange(gained.size) < len(self.folds))
 
-    def _squares(self, effects: Sequence[int], off: Sequence[int] = ()) -> tuple[np.ndarray, np.ndarray]:
-        key, loose = (tuple(sorted(self.among.index(j) for j in which)) for which in (effects, off))
-        if (key, loose) not in self.computed:
+    def _squares(self, effects: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        key = tuple(sorted(self.among.index(j) for j in effects))
+        if key not in self.computed:
             x = fitted(self.whole, tuple(sorted(effects))).x[: self.whole.spectrum.num_nuisances]
-            each = [self._predicted(train, test, key, loose) for train, test in self.folds]
+            each = [self._predicted(train, test, key) for train, test in self.folds]
             each = np.array([*each, (float(x @ x), 0.0)])
-            self.computed[key, loose] = each[:, 0], each[:, 1]
-        return self.computed[key, loose]
+            self.computed[key] = each[:, 0], each[:, 1]
+        return self.computed[key]
 
-    def _predicted(
-        self, train: Forms, test: Forms, effects: tuple[int, ...], off: tuple[int, ...]
-    ) -> tuple[float, float]:
+    def _predicted(self, train: Forms, test: Forms, effects: tuple[int, ...]) -> tuple[float, float]:
         """Squares of a held-out trial, and the log determinant of its noise over the stated one.
 
-        `effects` and those whose forms may be `off` are indices into `among`.
+        `effects` are indices into `among`.
         """
         model, taken = fitted(train, effects), quadratic_forms(test, effects)
-        weight = np.exp(-taken.shift) / (self.noise[channel_of(test)] + form_error(test, fitted(train, off)))
+        weight = np.exp(-taken.shift) / self.noise[channel_of(test)]
         loose = ~model.at_bound  # parameters at a bound stay there, even if this trial does not show them
         precision = np.diag(np.where(loose, 0.0, 1.0))
         precision[np.ix_(loose, loose)] = np.linalg.inv(model.covariance[np.ix_(loose, loose)])

@@ -459,6 +459,15 @@ def test_a_small_cause_beside_a_large_one_is_needed_where_the_form_of_the_large_
     speaks = both.score - fitted(f, ()).score
     assert RESPONSE * speaks < both.score - alone.score < MODELLED * speaks
     assert (_certainty(f, (0, 2), 2) > 0) == needed
+    nothing, n = np.zeros(0), gap.residual.size  # nor is what only scatters
+    loud = 8.0 * (gap.rows.channel == 2)
+    roll = Candidate(
+        "roll", (), nothing, nothing, nothing, np.zeros(n), np.zeros((n, 0)), nothing, nothing, loud
+    )
+    more = gap.residual * np.where(loud > 0, 3.0, 1.0)
+    f = forms(replace(gap, residual=more, candidates=(replace(large, form=form), roll)))
+    causes = _examined(f, (0, 1), search.sought(f), np.ones(f.count.size), np.random.default_rng(0)).causes
+    assert (1 in causes) == needed
 
 
 def test_of_two_causes_that_can_spare_each_other_one_is_needed():
