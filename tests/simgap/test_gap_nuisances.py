@@ -251,6 +251,19 @@ def test_products_of_noise_are_their_expectations():
     assert products(s.columns, s.group).sum(0)[0, 0] == pytest.approx(gap.residual @ gap.residual)
 
 
+def test_noise_is_as_stated_where_an_effect_was_linearised_though_a_noisy_property_moved_with_it():
+    soft, give = softer(0.0, 1.0), 0.5  # the give is a property; a push is the effect
+    (pad,), push = soft.candidates, np.sin(soft.rows.time)
+    shift, n = 2.0 * push - give * pad.jacobian[:, 0], push.size
+    noise = soft.carried[:, :, [0, 2, 2, 2]] * [1.0, 1.0, -give, 0.0]
+    pushed = replace(pad, at=np.array([2.0]), shift=shift, jacobian=push[:, None], moved=np.array([give]))
+    gap = Gap(soft.rows, soft.residual, pad.jacobian, (pushed,), carried=noise)
+    at = np.array([1.0, -give, -1.0, -2.0])  # residual less property and effect
+    still = replace(gap, candidates=(replace(pushed, moved=np.zeros(0)),))
+    found, off = (float(at @ of_noise(g, spectrum(g)).sum(0) @ at) for g in (gap, still))
+    assert abs(found) < 1e-6 * n and abs(off) > 0.01 * n
+
+
 @pytest.mark.parametrize("error", [0.0, 1.0])
 def test_noise_alone_is_no_effect_and_an_effect_has_its_own_size(error):
     gap = linearised(softer(0.0, 1.0, error=error))
