@@ -35,7 +35,7 @@ from itertools import pairwise, product
 import numpy as np
 
 from estimation.design import RISE, Design, PadDoubt
-from estimation.observations import APART, MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
+from estimation.observations import MIN_FREE, WeighedTrial, channel_values, free_forces, gravity_factor
 from estimation.pads import MISSTATED, SLOPE_SD
 from hmmseg.contact.decompose import ON_GROUND
 from hmmseg.errors import InputError
@@ -43,7 +43,7 @@ from hmmseg.hand.plausibility import scale_to_velocity
 from hmmseg.hand.sensing import WHITE
 from hmmseg.io.rig import Rig
 from hmmseg.io.trial import position_pairs
-from hmmseg.levels import CERTAIN, MOVED
+from hmmseg.levels import AROUND, CERTAIN, MOVED
 from hmmseg.robust import robust_sd
 from hmmseg.segmentation.align import AlignedTrials
 
@@ -285,7 +285,7 @@ def _room(aligned: AlignedTrials, weighed: Sequence[WeighedTrial]) -> Iterator[T
             else:
                 after = [k for k in of_it if k > grip.subtask]
                 since, until = end, spans[min(after)][0] if after else s.t[-1] + 1
-            at = (s.t > since + APART) & (s.t < until - APART)
+            at = (s.t > since + AROUND) & (s.t < until - AROUND)
             floor = grip.y - MOVED if grip.beneath else -np.inf
             for x, y in ((s.x1, s.y1), (s.x2, s.y2)):
                 within = at & (y < grip.y) & (y > floor)

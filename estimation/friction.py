@@ -23,7 +23,6 @@ from hmmseg.robust import robust_sd
 from hmmseg.segmentation.emissions import acceleration
 
 FEWEST = 4  # numerics: least samples of sliding
-WIDEST = 0.3  # chosen: relative sd above which the load varied too little
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def ground_friction(
         left = (pushed - mean[:, None] * right).mean(axis=0)
     freedom = max(push.size - 3, 1)  # few where a slide is short
     draws = mean + np.sqrt(square * (left @ left) / freedom) * rng.standard_t(freedom, DRAWS)
-    return GroundFriction(support, draws) if 0 < draws.std() < WIDEST * draws.mean() else None
+    return GroundFriction(support, draws) if draws.mean() > SHOWN * draws.std() > 0 else None
 
 
 def _rows(a: WeighedTrial, step: Subtask, rig: Rig) -> np.ndarray:

@@ -23,7 +23,7 @@ from hmmseg.contact.decompose import ABOVE_GROUND, FREE, ON_GROUND, Subtask
 from hmmseg.contact.equations import block_width, block_y, inertia_factor, pads_of
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import FORCE_CHANNELS, Rig
-from hmmseg.levels import TAIL
+from hmmseg.levels import AROUND, TAIL
 from hmmseg.robust import coarse_step, median_of_known, robust_sd
 from hmmseg.segmentation.align import AlignedTrials, TrialAlignment
 from hmmseg.segmentation.emissions import acceleration, thin
@@ -120,7 +120,6 @@ def autocorrelation_time(series: list[np.ndarray]) -> float:
 CHANNELS = ("force", "distance", "rise")
 KEYS = ("force", "distance", "pickup", "place")  # the means of a grip; a rise is place less pickup
 NUM_ALIGNMENTS = 16  # numerics: draws of all boundaries; their mean is known to a quarter of their sd
-APART = 0.1  # chosen: s; longest time between the two fingers' touches or releases
 MIN_FREE = 8  # numerics: least samples of free motion to estimate the scale of forces
 
 
@@ -273,7 +272,7 @@ def aligned_weights(aligned: AlignedTrials, rng: np.random.Generator) -> tuple[l
 def _free_samples(s: Signals, free: np.ndarray) -> np.ndarray:
     """Samples (num_timesteps,) of `free` motion with all forces, apart from changes of contact."""
     free = free & np.isfinite(s.fx1 + s.fy1 + s.fx2 + s.fy2)
-    margin = 1 + int(np.ceil(APART / float(np.median(np.diff(s.t)))))
+    margin = 1 + int(np.ceil(AROUND / float(np.median(np.diff(s.t)))))
     return free & (np.convolve(~free, np.ones(2 * margin + 1), "same") == 0)
 
 

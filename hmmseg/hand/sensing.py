@@ -20,9 +20,9 @@ import numpy as np
 from hmmseg.hand.plausibility import Finding, changed, check_forces
 from hmmseg.hand.tool import Tool
 from hmmseg.io.rig import FORCE_CHANNELS, JOINTS, Rig
-from hmmseg.io.trial import Trial, position_pairs
+from hmmseg.io.trial import CARTESIAN_CHANNELS, Trial, position_pairs
 from hmmseg.io.units import UNITS
-from hmmseg.levels import SURE
+from hmmseg.levels import CERTAIN, SURE
 from hmmseg.robust import coarse_step, extent, robust_sd, runs, white_sd
 
 NEAR = 0.3  # limit: relative error of a stated noise; units differ by factors of 4 and more
@@ -98,7 +98,8 @@ def noise_of(channels: list[np.ndarray]) -> float:
     return float(np.sqrt(np.mean(pieces[-1] ** 2) / 6)) if pieces else 0.0
 
 
-CHANCE = 1e-4  # chosen: probability a channel below which a run of repeated or missing readings is a fault
+# Probability below which a run of repeated or missing readings is a fault: rare in a healthy recording.
+CHANCE = (1 - CERTAIN) / len(CARTESIAN_CHANNELS)
 SCATTERS = -1 / 3  # numerics: correlation of second differences: -2/3 of white noise, positive if smooth
 FAR = 5.0  # limit: ranges of all other readings that one may be off by; an impact is less
 FEW = 0.01  # limit: share of readings that may be so far off; if more are, the others are no standard

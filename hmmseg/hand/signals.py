@@ -191,7 +191,6 @@ def central_differences(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, 
     return out, window
 
 
-SPAN = 0.01  # chosen: s; fingers change their speed over some hundredths of a second
 LONGEST = 4  # chosen: samples that a drive's difference spans at most
 # numerics: residual of velocities that repeat such differences, up to rounding, over that of independent ones
 ALIKE = 0.1
@@ -234,10 +233,10 @@ def one_sided(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
     [1/s].
 
     Each uses samples of its own side, as a difference across a touch belongs to neither: the slope at the end
-    of a parabola through three readings SPAN (or a sample interval) apart.
+    of a parabola through three readings.
     """
     there = np.isfinite(values)
-    h = max(SPAN, float(np.median(np.diff(t))))
+    h = float(np.median(np.diff(t)))
     noise = float(np.sqrt(1.5**2 + 2**2 + 0.5**2) / h)
     if there.sum() < 2:
         return np.full((2, t.size), np.nan), noise

@@ -27,7 +27,7 @@ from hmmseg.hand.sensing import tool_warnings
 from hmmseg.hand.tool import Pose, Tool, applied_force, free_tool, order_warnings, pose_of, smooth
 from hmmseg.io.rig import AXES, Gripper, Rig, direction
 from hmmseg.io.trial import ROLL, Trial
-from hmmseg.levels import MOVED, SHOWN, SURE
+from hmmseg.levels import AROUND, MOVED, SHOWN, SURE
 from hmmseg.robust import bridged, extent, robust_sd, runs
 
 WIDEST = 1.0  # limit: m; no parallel gripper opens further
@@ -253,8 +253,6 @@ def bears(start: int, stop: int, pose: Pose, force: np.ndarray, tool: Tool) -> f
 # springs
 LAG = 0.012
 TILT = 0.01  # prior: rad; tilt of a hand whose orientation is not recorded
-SURELY = 0.1  # chosen: s from any grip beyond which nothing is held; a touch is known to a fifth of it
-STRAY = 0.3  # chosen: N; a touch in free motion that is reported, if it outlasts the smoothing
 NOMINAL = 1.0  # numerics: N; force assumed for a grip of rigid pads if none was measured; any will do
 HIDDEN_GRIP = (
     "a wrist sensor does not feel what the fingers press against each other with; grip_force under "
@@ -386,7 +384,7 @@ def as_fingers(trial: Trial, rig: Rig, pose: Pose, tool: Tool, opening: np.ndarr
     touches = tuple(touch for each in grips for touch in _touches(t, opening, each))
     surely = np.ones(t.size)
     for each in grips:
-        surely[(t > t[each.start] - SURELY) & (t < t[min(each.stop, t.size) - 1] + SURELY)] = 0.0
+        surely[(t > t[each.start] - AROUND) & (t < t[min(each.stop, t.size) - 1] + AROUND)] = 0.0
     from scipy.ndimage import maximum_filter1d  # slow to import
 
     wrong, step = _inertia(t, pose, tool, rig.wrist.turns, rig.gravity), float(np.median(np.diff(t)))
@@ -429,7 +427,7 @@ def _around(t: np.ndarray, pose: Pose) -> int:
 def _strays(trial: Trial, free: np.ndarray, felt: np.ndarray, tool: Tool, window: float) -> list[str]:
     """Reports of forces in free motion, by the opening, that last."""
     t, out = trial.t, []
-    for start, stop in runs(free & (np.nan_to_num(felt) > max(2 * SURE * tool.noise, STRAY))):
+    for start, stop in runs(free & (np.nan_to_num(felt) > 2 * SURE * tool.noise)):
         if t[stop - 1] - t[start] > window:
             most = float(np.nanmax(felt[start:stop]))
             when = f"from {t[start]:.2f} to {t[stop - 1]:.2f} s, with up to {most:.2g} N"

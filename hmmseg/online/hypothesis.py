@@ -175,7 +175,6 @@ def widen(extremes: np.ndarray, ranges: np.ndarray, least: np.ndarray, x: Any) -
 
 
 STILL = 0.2  # prior: share of samples at which a moving hand stands still
-CREEP = 0.005  # chosen: m/s; a hand at rest creeps by a few mm/s
 JUST_LIFTED = 0.05  # prior: factor of STILL while a lift begins: slow, but a motion
 _LOG_CLOSE, _LOG_STRAY, _LOG_REST = math.log1p(-STRAY), math.log(STRAY), math.log1p(-2 * STRAY)
 _LOG_SILENT, _LOG_ONE = math.log1p(-ONE_FINGER), math.log(ONE_FINGER / 2)
@@ -364,8 +363,7 @@ def supported(
     # The load of a resting block is steady; so is a weight, where nothing else rests.
     if not math.isnan(change) and (not weighed or load < most - SURE * sd):
         same = log_student(change, 2 * math.sqrt(_square(h, FORCE)))
-        same += log_student(x.vy, math.sqrt(x.sd_vy**2 + CREEP**2))
-        resting = log_sum(_LOG_MOVING + resting, _LOG_STILL + same)
+        resting = log_sum(_LOG_MOVING + resting, _LOG_STILL + same + upward)
     if levels and h.level[1] > 0.0:
         spread = x.sd_y * x.sd_y + _square(h, LEVEL) + 1.0 / h.level[1]
         risen = _held_height(h, x, pads) - h.level[0] / h.level[1]

@@ -22,17 +22,16 @@ from hmmseg.io.rig import Rig
 from hmmseg.io.task import BlockTask, SequenceTask
 from hmmseg.io.trial import Trial
 from hmmseg.segmentation.align import align as align_blocks
+from hmmseg.segmentation.posteriors import INTERVAL
 from hmmseg.segmentation.spans import Segmentation, most_telling
 from hmmseg.sequence.fit import fit_sequence
 from hmmseg.sequence.model import SequenceModel
 from hmmseg.sequence.segment import segment_sequence
 
-SPREAD = (0.05, 0.95)  # chosen: quantiles whose distance is a channel's scale
 BINS = 16  # chosen: bins of a subtask whose means are compared
 EARLY = 6  # chosen: of these, the bins in the time right after its event
 EVENT = 0.5  # chosen: s; that time, or a quarter of the shortest trial's subtask
 SUB_BANDS = 8  # chosen: sub-bands of fast power, evenly spaced in log frequency
-LOWEST = 6  # chosen: half periods per window at which fast power begins
 FEWEST = 3  # chosen: fewest DCT coefficients of a sub-band, and of a window's fast power
 FLOOR = 1e-4  # numerics: rms over a channel's scale; keeps logarithms of power finite
 SLOW, FAST, DURATION = range(3)
@@ -171,11 +170,11 @@ def _channels(trials: Sequence[Trial], task: SequenceTask) -> tuple[str, ...]:
 
 
 def _standardised(trials: Sequence[Trial], channels: tuple[str, ...]) -> list[Trial]:
-    """Trials with every channel shifted and scaled to median 0 and spread 1 over all of them."""
+    """Trials with every channel at median 0, in units of the range of its central 90 %, over all of them."""
     out: list[dict[str, np.ndarray]] = [{} for _ in trials]
     for name in channels:
         values = np.concatenate([t.channels[name] for t in trials])
-        low, middle, high = np.nanquantile(values, (SPREAD[0], 0.5, SPREAD[1]))
+        low, middle, high = np.nanquantile(values, (INTERVAL[0], 0.5, INTERVAL[1]))
         for k, trial in enumerate(trials):
             out[k][name] = (trial.channels[name] - middle) / (high - low or 1.0)
     return [Trial(t.file, t.t, columns) for t, columns in zip(trials, out, strict=True)]
@@ -227,13 +226,12 @@ def layout(given: Ensembles) -> Layout:
     spread = np.zeros(len(given.channels))
     for kind in (given.real, given.sim):
         values = [np.concatenate([c.trial.channels[n] for c in kind]) for n in given.channels]
-        spread = np.maximum(spread, [np.subtract(*np.nanquantile(v, SPREAD[::-1])) for v in values])
+        spread = np.maximum(spread, [np.subtract(*np.nanquantile(v, INTERVAL[::-1])) for v in values])
     event = np.minimum(EVENT, shortest / 4)
     event[(np.arange(event.size) == 0) | (event * rate < 2 * EARLY)] = 0.0
     window = (shortest * rate).astype(int)
     bins = np.clip(shortest * rate // 4, 1, BINS).astype(int)
-    lowest = np.maximum(LOWEST, np.ceil(window * bins / (shortest * rate)).astype(int))
-    subs = tuple(_sub_bands(int(low), int(n)) for low, n in zip(lowest, window, strict=True))
+    subs = tuple(_sub_bands(int(low), int(n)) for low, n in zip(bins, window, strict=True))
     rows, every = [], range(len(given.subtasks))
     for c in range(len(given.channels)):
         rows += [(c, k, SLOW, 1) for k in every for _ in range(bins[k])]

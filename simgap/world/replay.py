@@ -29,8 +29,7 @@ from simgap.world.virtual_model import Surroundings, physics, rollout, standing,
 
 REACHES = (1, 2, 3, 4, 6, 8, 12, 16, 24)  # numerics: samples on either side
 TOLERANCE = 1.2  # prior: standard deviation over the sensors', as a held finger still trembles
-LEVEL = 0.1  # chosen: level of the test that rejects a window
-AGREEMENT = 1.5  # chosen: standard deviations within which a wider window must agree with the narrower ones
+LEVEL = 0.1  # chosen: level of the tests that reject a window: by its residuals, and by the narrower ones
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ def smooth(t: np.ndarray, position: np.ndarray, velocity: np.ndarray, sd_positio
     for reach in REACHES:
         for k, (before, after) in enumerate(sides):
             found, fits = _windows(t, samples, weights, reach * before, reach * after)
-            width = AGREEMENT * np.sqrt(found[..., 2])
+            width = np.sqrt(found[..., 2] * 2 * gammaincinv(1 / 2, 1 - LEVEL))
             agrees = (found[..., 0] >= low) & (found[..., 0] <= high)
             growing[k] &= fits & agrees
             low = np.where(growing[k], np.maximum(low, found[..., 0] - width), low)
