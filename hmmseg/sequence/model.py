@@ -22,7 +22,6 @@ from hmmseg.io.formats.npz import unpack
 from hmmseg.io.task import SequenceTask
 from hmmseg.robust import NORMAL
 from hmmseg.segmentation.spans import Failure
-from hmmseg.sequence.courses import WEIGHING
 from hmmseg.sequence.emissions import LEAST_CELLS, Detectors, StudentEmissions, transitions, weigh
 from hmmseg.sequence.features import FeatureMap, SequenceFeatures
 from hmmseg.tables import Tabled, listed
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 FORMAT = "hmmseg.sequence-model/3"
+INDEPENDENT = 250.0  # chosen: independent observations to which the evidence of one trial is coarsened
 WIDTHS = 6.0  # chosen: a score that exceeds the usual by this many widths is a misfit
 LEAST_WIDTH = (2.0, 0.02)  # chosen: nats for the first score, nats per cell for the second
 FEW = 4.0  # chosen: trials; the usual width of n trials is widened by the factor 1 + FEW / n
@@ -106,7 +106,7 @@ class SequenceModel(Tabled):
         """
         model, temper = replace(self, detectors=None), self.emissions.temper
         if self.detectors is None:
-            temper *= WEIGHING.independent / (WEIGHING.independent + temper * trial.values.size)
+            temper *= INDEPENDENT / (INDEPENDENT + temper * trial.values.size)
             model = replace(model, emissions=replace(self.emissions, temper=temper))
         ll, alignment = model.emissions.log_likelihoods(trial.values), model.align(trial)
         better = ergodic.log_evidence(*self._free(ll)) - alignment.log_evidence
