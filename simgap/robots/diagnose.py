@@ -7,7 +7,7 @@ held-out logs, verdict, next experiment. `describe` makes the JSON document.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hmmseg.errors import InputError, nearest
@@ -122,7 +122,8 @@ def diagnose(
         )
         if found.verdict.causes:
             break
-    return found
+    tell("calibration")
+    return replace(found, calibrated=found.search.calibration or calibrated(STATED, found.best.point))
 
 
 def _diagnosed(
@@ -136,7 +137,7 @@ def _diagnosed(
     note: Progress,
     groups: Sequence[int] | None,
 ) -> RobotDiagnosis:
-    """The diagnosis along some of the windows."""
+    """The diagnosis along some of the windows, without the calibrated model."""
     warnings: list[str] = []
 
     def said(text: str) -> None:
@@ -161,9 +162,7 @@ def _diagnosed(
     tell("how far")
     far = shrinkage(best, nothing, composed, fold) if best.names else None
     verdict = verdict_on(search, best, far, phases, seed, bool(forced))
-    tell("calibration")
     return RobotDiagnosis(
         composed, phases, search, best, verdict, far if verdict.causes else None, search.identifiable,
-        next_log(search, best, verdict), search.calibration or calibrated(STATED, best.point),
-        tuple(warnings),
+        next_log(search, best, verdict), None, tuple(warnings),
     )  # fmt: skip

@@ -181,6 +181,12 @@ def _touching(simulator: Simulator, log: Recording) -> np.ndarray:
     return np.array([bool(pairs) for pairs in what])[np.maximum(latest, 0)]
 
 
+def meets(simulator: Simulator, run: Recording) -> bool:
+    """Whether bodies touch along a run of a window; a touch next to its ends is its neighbour's."""
+    inside = (run.t > run.t[0] + REACH) & (run.t < run.t[-1] - REACH)
+    return bool(_touching(simulator, run)[inside].any())
+
+
 def _readable(simulator: Simulator, log: Recording, end: int) -> int:
     """The first row from which a first window up to `end` can begin: with samples on either side.
 
