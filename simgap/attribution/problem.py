@@ -9,7 +9,7 @@ which it was linearised: shift_j(theta) = shift + jacobian @ (theta - at).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -96,7 +96,6 @@ class Candidate:
         size: What relative errors (k,) of parameters refer to; their deviation from neutral if None or NaN.
         frees: Most additional variance (n,) of each cosine coefficient, in units of the noise's, if it acts.
         beside: Effects that acted where it was linearised; one without is listed before.
-        moved: First nuisances (k,) where it was linearised, less those of the fit without effects.
     """
 
     name: str
@@ -115,7 +114,6 @@ class Candidate:
     size: Float[np.ndarray, " k"] | None = None
     frees: np.ndarray | None = None
     beside: tuple[str, ...] = ()
-    moved: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def form_of(self) -> tuple[str, tuple[str, ...]]:
@@ -142,7 +140,6 @@ class Gap:
         usual: Whether the tolerance is a default; a cause that is found then matters in any case.
         mean_square: Mean square (n,) of each row if nothing acts, less for repeats that share an error;
             None for 1.
-        best: First nuisances (k,) of the fit without effects.
     """
 
     rows: Rows
@@ -153,7 +150,6 @@ class Gap:
     tolerance: Float[np.ndarray, " n"] | None = None
     usual: bool = False
     mean_square: Float[np.ndarray, " n"] | None = None
-    best: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     def taken(self, rows: np.ndarray) -> Gap:
         """The gap on some rows (a mask or indices)."""
@@ -199,12 +195,12 @@ class Gap:
 
     @property
     def to_fit(self) -> Float[np.ndarray, "m m"]:
-        """The matrix that, from the right, replaces residual and shifts in the raw columns by those with
-        nuisances at their best fit."""
-        out = np.eye(len(self.to_constant))
-        out[1 : 1 + self.best.size, 0] = -self.best
-        for c, mine in zip(self.candidates, self.own_columns, strict=True):
-            out[1 : 1 + c.moved.size, mine[0]] = c.moved
+        """The matrix that, from the right, takes off what nuisances absorb of residual and shifts."""
+        out, absorb = np.eye(len(self.to_constant)), slice(1, 1 + self.nuisance.shape[1])
+        constants = np.column_stack([self.residual, *(c.shift for c in self.candidates)])
+        curvature = self.nuisance.T @ self.nuisance + np.eye(self.nuisance.shape[1])
+        at = [0, *(mine[0] for mine in self.own_columns)]
+        out[absorb, at] = -np.linalg.solve(curvature, self.nuisance.T @ constants)
         return out
 
 

@@ -300,8 +300,7 @@ def gap_of(
         measured = [c for c in _measured(problem, healthy) if c.parameters in seen]
         every = (*shifting, *scattering, *measured)
         residual = _at_nominal(healthy, healthy)
-        best = healthy.u[: problem.num_common]
-        return Gap(rows, residual, nuisance, every, tolerance=tolerance, usual=usual, best=best)
+        return Gap(rows, residual, nuisance, every, tolerance=tolerance, usual=usual)
 
     gap = at(given, healthy, fits)
     if not redrawn:
@@ -365,12 +364,11 @@ def _joint(given: Problem, healthy: Fitted, joint: Fitted) -> list[Candidate]:
         u[own] = 0.0
         alone.append(residual_at(given, rest, u)[given.there] - joint.residual)
     both, doubts = (all_of_them - sum(alone)) / len(alone), (joint.doubts - healthy.doubts) / len(alone)
-    moved = (joint.u[:k] - healthy.u[:k]) / len(alone)
     out, at = [], k
     for key, rest, shift in zip(joint.effects, others, alone, strict=True):
         free = free_of(key)
         out.append(_candidate(given, key, joint.columns[at : at + len(free)], joint.u, shift + both,
-                              joint.jacobian[:, at : at + len(free)], doubts, moved, rest))  # fmt: skip
+                              joint.jacobian[:, at : at + len(free)], doubts, rest))  # fmt: skip
         at += len(free)
     return out
 
@@ -401,8 +399,8 @@ def _at_nominal(f: Fitted, healthy: Fitted) -> np.ndarray:
 def _shifting(given: Problem, f: Fitted, healthy: Fitted) -> Candidate:
     """A fit of one effect as a candidate: its shift with properties at their nominal values."""
     k, shift = given.num_common, _at_nominal(healthy, healthy) - _at_nominal(f, healthy)
-    doubts, moved = f.doubts - healthy.doubts, f.u[:k] - healthy.u[:k]
-    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.jacobian[:, k:], doubts, moved)
+    doubts = f.doubts - healthy.doubts
+    return _candidate(given, f.effects[0], f.columns[k:], f.u, shift, f.jacobian[:, k:], doubts)
 
 
 def _candidate(
@@ -413,12 +411,11 @@ def _candidate(
     shift: np.ndarray,
     jacobian: np.ndarray,
     doubts: float,
-    moved: np.ndarray,
     beside: Sequence[str] = (),
 ) -> Candidate:
     """One form of an effect as a candidate, linearised at coordinates u `beside` effects of other keys.
 
-    `own` are its columns among the coordinates; properties `moved` with it.
+    `own` are its columns among the coordinates.
     """
     free, effect = free_of(key), catalogue()[name_of(key)]
     low, high = slots(given.num_common)[1][:, own]
@@ -432,7 +429,6 @@ def _candidate(
         size=np.array([1 / p.sd if p.log else np.nan for p in free]),
         frees=_turning(given, turned) if effect.turns else None,
         beside=tuple(name_of(k) for k in beside),
-        moved=moved,
     )  # fmt: skip
 
 
