@@ -122,23 +122,23 @@ def of_noise(gap: Gap, s: Spectrum) -> np.ndarray:
     """Part (G, M, M) of the products of a spectrum's columns that is due to noise.
 
     The square of the residual is left out, and so are terms of second order in deviations from the point of
-    linearisation, that of the nuisances included: without a change of curvature every mode stays a maximum.
+    linearisation: without a change of curvature every mode stays a maximum.
     """
     assert gap.carried is not None
-    constants = [0, *(mine[0] for mine in gap.own_columns)]
-    fit, number = gap.to_fit, gap.carried.shape[2]
+    number = gap.carried.shape[2]
     out = np.zeros((int(s.group.max()) + 1, number, number))
+    noisy = np.flatnonzero((gap.carried != 0).any((0, 1)))
+    for draw in gap.carried:
+        out[:, noisy[:, None], noisy] += products(draw[:, noisy].astype(float), s.group)
     slopes = np.ones(number, bool)
-    slopes[constants] = False
-    noisy = np.flatnonzero(~slopes | (gap.carried != 0).any((0, 1)))
-    for draw in gap.carried.astype(float):
-        draw[:, constants] = draw @ fit[:, constants]
-        out[:, noisy[:, None], noisy] += products(draw[:, noisy], s.group)
+    slopes[[0, *(mine[0] for mine in gap.own_columns)]] = False
     out[:, slopes[:, None] & slopes] = 0.0
     out[:, 0, 0] = 0.0
-    turned = np.linalg.solve(fit, gap.to_constant)[:, constants]  # the identity but for the constants
-    out[:, :, constants] = out @ turned
-    out[:, constants] = turned.T @ out
+    turn = gap.to_constant  # the identity except in columns of shifts
+    shifts = [mine[0] for mine in gap.own_columns]
+    turned = turn[:, shifts]
+    out[:, :, shifts] = out @ turned
+    out[:, shifts] = turned.T @ out
     return out
 
 

@@ -193,16 +193,6 @@ class Gap:
             out[mine[1:], mine[0]] = -(c.at - c.neutral) / c.scale
         return out
 
-    @property
-    def to_fit(self) -> Float[np.ndarray, "m m"]:
-        """The matrix that, from the right, takes off what nuisances absorb of residual and shifts."""
-        out, absorb = np.eye(len(self.to_constant)), slice(1, 1 + self.nuisance.shape[1])
-        constants = np.column_stack([self.residual, *(c.shift for c in self.candidates)])
-        curvature = self.nuisance.T @ self.nuisance + np.eye(self.nuisance.shape[1])
-        at = [0, *(mine[0] for mine in self.own_columns)]
-        out[absorb, at] = -np.linalg.solve(curvature, self.nuisance.T @ constants)
-        return out
-
 
 @dataclass(frozen=True)
 class Spectrum:

@@ -251,23 +251,6 @@ def test_products_of_noise_are_their_expectations():
     assert products(s.columns, s.group).sum(0)[0, 0] == pytest.approx(gap.residual @ gap.residual)
 
 
-def test_noise_is_as_stated_where_an_effect_was_linearised_though_a_noisy_property_moved_with_it():
-    soft, give = softer(0.0, 1.0), 0.5  # the give is a property, which a push moves
-    (pad,), push = soft.candidates, np.sin(soft.rows.time)
-    shift = 2.0 * push - give * pad.jacobian[:, 0]
-    noise = soft.carried[:, :, [0, 2, 2, 2]] * [1.0, 1.0, -give, 0.0]
-    pushed = replace(pad, at=np.array([2.0]), shift=shift, jacobian=push[:, None])
-    gap = Gap(soft.rows, soft.residual, pad.jacobian, (pushed,), carried=noise)
-    curvature = pad.jacobian.T @ pad.jacobian + 1
-    without, with_it = (
-        np.linalg.solve(curvature, pad.jacobian.T @ r)[0] for r in (gap.residual, gap.residual - shift)
-    )
-    there = np.array([1.0, -with_it, -1.0, -2.0])  # less property and effect
-    found = float(there @ of_noise(gap, spectrum(gap)).sum(0) @ there)
-    of = [np.square(noise @ one).sum() for one in ([1, -with_it, -1, 0], [1, -without, 0, 0])]
-    assert found == pytest.approx(of[0] - of[1], rel=0.01) and abs(found) > 0.01 * push.size
-
-
 @pytest.mark.parametrize("error", [0.0, 1.0])
 def test_noise_alone_is_no_effect_and_an_effect_has_its_own_size(error):
     gap = linearised(softer(0.0, 1.0, error=error))
