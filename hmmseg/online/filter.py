@@ -70,7 +70,7 @@ from hmmseg.segmentation.rounds import one_round, round_tasks
 WARM_UP = 8  # numerics: rows from which a force noise that the rig does not state is estimated
 NUM_CHANNELS = len(CARTESIAN_CHANNELS)
 KINDS = {FREE: FREE_KIND, ON_GROUND: GROUND_KIND, SLIDING: SLIDING_KIND, ABOVE_GROUND: ABOVE_KIND}
-# prior: initial scales [m/s, m, m]: a hand at rest creeps, and pads' foam gives by tenths of a mm
+# chosen: initial scales [m/s, m, m]: a hand at rest creeps, and pads' foam gives by tenths of a mm
 VELOCITY, LEVEL, WIDTH = 5e-3, 2e-4, 2e-4
 PRIOR = 4.0  # prior: readings that an initial scale is worth
 # prior: ranges of a hand before it has moved: vx, vy [m/s], y, d [m]; worth a few nats at most

@@ -125,6 +125,7 @@ def _depths(
     return depth, residual, DEPENDENT * curved / scale**2 + (1 - DEPENDENT) / DEPTH**2
 
 
+SUPPORTED = 0.85  # chosen: share of a block's weight on the fingers below which it surely rests
 FARTHEST = 0.5  # numerics: s; values further from a contact than any candidate delay are dropped
 
 
@@ -159,7 +160,7 @@ def stretches(
     fx1, fx2 = s.fx1 - p.bias[0], s.fx2 - p.bias[2]
     fy = s.fy1 + s.fy2 - p.bias[1] - p.bias[3]
     noise = np.sqrt(2.0) * sd_force
-    resting = fy < weight - SHOWN * noise
+    resting = fy < min(SUPPORTED * weight, weight - SHOWN * noise)
     pressing = inside & (fx1 > SURE * sd_force) & (-fx2 > SURE * sd_force)
     out = list[Stretch | None]()
     for load, value, rate, stated, within in (

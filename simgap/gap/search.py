@@ -100,7 +100,11 @@ def best_fit(given: Problem, key: str, base: Fitted) -> Fitted:
     if len(leading) > 1:
         leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
     # An effect on moments may change most of how easily blocks turn in the grip.
-    return fit(given, effects, fit(given, effects, leading[0], usual=usual).u)
+    found = fit(given, effects, fit(given, effects, leading[0], usual=usual).u)
+    if found.cost < base.cost + PROMISING:
+        return found
+    # The linear step led where an effect grows without end, and from where no way leads back.
+    return min(found, fit(given, effects, ranked[0][2], usual=usual), key=lambda f: f.cost)
 
 
 def _linear_step(

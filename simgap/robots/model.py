@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from simgap.latest import latest
 from simgap.robot_effects.base import RobotEffect
 from simgap.robots.rows import Rows, rows_of
 from simgap.robots.windows import DOUBT, FLIES, LENGTH, RESTS, STRIKES, Window, cut, meets, smoothed, start_of
@@ -50,7 +49,6 @@ class Composed:
     motion: tuple[int, ...] = ()
     about: Point = field(default_factory=dict)
     _slopes: dict[Any, Any] = field(default_factory=dict, repr=False)
-    _runs: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
@@ -210,23 +208,9 @@ class Composed:
     def _rolled(
         self, point: Point, windows: Sequence[Window], starts: Sequence[Mapping[str, float] | None]
     ) -> list[Channels | None]:
-        """True channels of windows, all from the simulator itself; the latest are kept."""
-        parameters = self.parameters(point)
-        acting = [(n, *v.items()) for n, v in point.items() if self.effects[n].command is not None]
-        along = tuple((w.log, w.first, w.end, w.regime) for w in windows)
-        begun = tuple(None if s is None else tuple(s.items()) for s in starts)
-        key = id(self.recordings), tuple(acting), tuple(parameters.items()), along, begun
-
-        def made() -> Any:  # with the recordings, so that no others have their id
-            return self.recordings, self._run(point, parameters, windows, starts)
-
-        return [*latest(self._runs, key, made)[1]]
-
-    def _run(
-        self, point: Point, parameters: Mapping[str, float], windows: Sequence[Window],
-        starts: Sequence[Mapping[str, float] | None],
-    ) -> list[Channels | None]:  # fmt: skip
-        recordings, jobs, leads = self.commanded(point), [], []
+        """True channels of windows, all from the simulator itself."""
+        recordings, parameters = self.commanded(point), self.parameters(point)
+        jobs, leads = [], []
         for window, start in zip(windows, starts, strict=True):
             along, lead = recordings[window.log].window(window.first, window.end), 0
             if window.regime == RESTS:

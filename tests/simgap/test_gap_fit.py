@@ -20,11 +20,12 @@ from simgap.attribution.posterior import fitted, forms
 from simgap.attribution.search import sought
 from simgap.effects import catalogue, effect_named
 from simgap.gap import diagnose
+from simgap.gap import search as searching
 from simgap.gap.assemble import gap_of, scatters, together
 from simgap.gap.frame import CHANNELS, build, shown, shown_forms
 from simgap.gap.nuisances import shifted_by, with_nuisances
-from simgap.gap.problem import fit, neutral, problem, slots
-from simgap.gap.search import Search, best_fit, candidate_names, search
+from simgap.gap.problem import columns_of, fit, free_of, neutral, problem, slots
+from simgap.gap.search import PROMISING, Search, best_fit, candidate_names, search
 from simgap.gap.simulated import performed
 from simgap.gap.simulated import recorded as read_out
 from simgap.patch import checked, files, replayed
@@ -127,6 +128,23 @@ def test_a_second_cause_is_sought_next_to_the_likeliest_one(healthy, monkeypatch
     monkeypatch.setattr(diagnose, "ALARM", 2.0)
     assert {*paired(keys).effects} == {"force_crosstalk", "joint_offset"}
     assert paired(keys[:1]) is None and paired(()) is None  # no second effect, none at all
+
+
+def test_a_linear_step_into_growth_without_end_is_taken_back(healthy, monkeypatch):
+    """A mode that drives itself: forces of 1e40 N, from which no descent leads back."""
+    given, plain = healthy
+    effects = ("structural_vibration",)
+    columns = columns_of(given, effects)[given.num_common :]
+    at = {p.name: column for p, column in zip(free_of(*effects), columns, strict=True)}
+
+    def astray(given, effects, u, usual):
+        there = u.copy()
+        there[at["drive"]], there[at["sin_grip_fx1"]] = -3.8, 15.0
+        return plain.cost - 100.0, there
+
+    monkeypatch.setattr(searching, "_linear_step", astray)
+    found = best_fit(given, *effects, plain)
+    assert found.cost < plain.cost + PROMISING and np.abs(found.residual).max() < 1e3
 
 
 def test_a_fit_converges_although_derivatives_from_before_the_effect_are_off():
