@@ -33,7 +33,7 @@ from hmmseg.contact.equations import Pads, pads_of
 from hmmseg.errors_in_variables import slope_between
 from hmmseg.hand.signals import Signals
 from hmmseg.io.rig import Rig
-from hmmseg.levels import FIRM, SURE, TAIL, decisive
+from hmmseg.levels import SURE, TAIL, decisive
 from hmmseg.robust import NORMAL, robust_sd, weighted_median
 from hmmseg.segmentation.emissions import Parameters, channel_sd
 from hmmseg.segmentation.stretches import (
@@ -64,6 +64,8 @@ NEAR = np.geomspace(0.75, 1.33, 49)  # numerics: multiples of the likeliest of t
 UNSTATED = np.geomspace(4e-5, 1.2e-3, 17)  # numerics: m/N; compliances of nominally rigid pads
 LAW_SHARE, LAW_LEAD = 0.05, 0.0015  # prior: relative deviation of a pad's force from its law, and lead [s]
 SOFT = 2e-4  # prior: m/N; sd of the compliance of nominally rigid pads
+# chosen: share of a squeeze's firmest load above which the block is held; below it, soft pads still give
+HOLD = 0.75
 FIRMEST = 0.95  # numerics: quantile of the loads
 SLOWEST_SD = 3e-5  # prior: m; noise of a distance that neither rig nor recording gives
 
@@ -161,7 +163,7 @@ def _moments(values: np.ndarray, log_weight: np.ndarray) -> tuple[float, float]:
 def _loads(s: Squeeze, compliances: np.ndarray) -> np.ndarray:
     """Loads [N] and absolute rates, (2, num_compliances, num_steps), at each STEP from the first sample."""
     load = np.nan_to_num(s.load)
-    holds = load >= FIRM * np.quantile(load, FIRMEST)
+    holds = load >= HOLD * np.quantile(load, FIRMEST)
     width = np.median(s.distance[holds] + compliances[:, None] * load[holds], axis=1, keepdims=True)
     distance = _joined(s.t, s.distance, s.rate)
     load = np.maximum(width - distance, 0.0) / compliances[:, None]
