@@ -27,6 +27,7 @@ from simgap.gap.problem import (
     Fitted,
     Problem,
     columns_of,
+    cost_at,
     evaluated,
     fit,
     free_of,
@@ -44,6 +45,7 @@ from simgap.progress import Progress, silent
 SCREEN = 2  # numerics: steps before the best start of a form is chosen
 LEADERS = 3  # numerics: starts that take these steps
 PROMISING = 2.0  # numerics: nats that a linear step must gain for a form to be fitted
+HALVINGS = 5  # numerics: of a linear step that leads up
 
 
 def candidate_names(rig: Rig, excluded: Sequence[str] = (), forced: Sequence[str] = ()) -> list[str]:
@@ -96,15 +98,27 @@ def best_fit(given: Problem, key: str, base: Fitted) -> Fitted:
         there = fit(given, effects, ranked[0][2], 0, usual)
         if there.cost < base.cost + PROMISING:  # else the step led too far to linearise there
             return there
-    leading = [u for _, u, _ in ranked[:LEADERS]]
+    leading = [_brought_back(given, effects, u, start) for _, u, start in ranked[:LEADERS]]
     if len(leading) > 1:
         leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
     # An effect on moments may change most of how easily blocks turn in the grip.
-    found = fit(given, effects, fit(given, effects, leading[0], usual=usual).u)
-    if found.cost < base.cost + PROMISING:
-        return found
-    # The linear step led where an effect grows without end, and from where no way leads back.
-    return min(found, fit(given, effects, ranked[0][2], usual=usual), key=lambda f: f.cost)
+    return fit(given, effects, fit(given, effects, leading[0], usual=usual).u)
+
+
+def _brought_back(
+    given: Problem, effects: tuple[str, ...], there: np.ndarray, start: np.ndarray
+) -> np.ndarray:
+    """Coordinates to which a linear step leads, halved back towards its start while they cost more than it.
+
+    Some filters turn recordings into oscillations that grow without end, from where no way leads back.
+    """
+    mine = columns_of(given, effects)
+    most = cost_at(given, effects, start, mine)[2]
+    for _ in range(HALVINGS):
+        if cost_at(given, effects, there, mine)[2] <= most:
+            return there
+        there = (there + start) / 2
+    return start
 
 
 def _linear_step(

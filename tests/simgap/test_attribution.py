@@ -549,3 +549,9 @@ def test_no_better_point_within_bounds_and_none_that_scipy_finds(seed, tight):
     assert np.abs(slope[~held]).max(initial=0.0) < 1e-9
     # At a bound going on would lead outside, or nothing would be gained by coming back.
     assert (slope[held & (x == low)] >= -1e-9).all() and (slope[held & (x == high)] <= 1e-9).all()
+
+
+def test_the_search_for_the_least_ends_where_rounding_left_a_matrix_indefinite():
+    indefinite = np.array([[0.25, -0.03, 1.94], [-0.03, -1.07, 1.31], [1.94, 1.31, -1.41]])
+    with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
+        least(indefinite, np.array([-1.27, -0.62, 0.04]), np.full(3, -0.5), np.full(3, 0.5))
