@@ -376,7 +376,10 @@ def fit(
         slope = given.nuisances.product(now.jacobian, now.residual) + now.doubt_slope + prior * u[mine]
         curvature = given.nuisances.product(now.jacobian, now.jacobian) + np.diag(prior)
         damped = curvature + damping * np.diag(np.diag(curvature))
-        step, _ = least(damped, -slope, low - u[mine], high - u[mine])
+        try:
+            step, _ = least(damped, -slope, low - u[mine], high - u[mine])
+        except np.linalg.LinAlgError:  # where an effect grows without end rounding leaves no minimum
+            break
         if -(slope + 0.5 * curvature @ step) @ step < CLOSE:
             break
         trial = u.copy()

@@ -145,6 +145,7 @@ def test_a_linear_step_into_growth_without_end_is_taken_back(healthy, monkeypatc
     monkeypatch.setattr(searching, "_linear_step", astray)
     found = best_fit(given, *effects, plain)
     assert found.cost < plain.cost + PROMISING and np.abs(found.residual).max() < 1e3
+    assert fit(given, effects, astray(given, effects, plain.u, None)[1]).cost > 1e9  # and it ends
 
 
 def test_a_fit_converges_although_derivatives_from_before_the_effect_are_off():
