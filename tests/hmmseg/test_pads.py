@@ -72,20 +72,23 @@ def test_a_fast_touch_tells_as_little_of_the_pads_as_is_known_of_the_delay():
     assert surely.value - 2.5e-4 > 4 * surely.sd  # had the delay been known
 
 
+def segmented(world, *numbers):
+    """The segmentations of trials of a world, and by how much their boundaries are off [s]."""
+    for judged in trials_of(world, numbers):
+        (found,) = segment([judged.trial], scene()[1], judged.rig)
+        yield found, np.array([s.start for s in found.spans[1:]]) - judged.boundaries
+
+
 def test_releases_of_grips_that_ring_are_not_early():
-    _, task = scene()
-    (judged,) = trials_of(WORLDS["ringing 1 N"], [78004])
-    (found,) = segment([judged.trial], task, judged.rig)
-    ends = np.array([s.start for s in found.spans[1:]])
-    assert np.abs(ends - judged.boundaries)[3::4].max() < 0.02  # 26 and 37 ms with pads taken to be rigid
+    ((_, residual),) = segmented(WORLDS["ringing 1 N"], 78004)
+    assert np.abs(residual)[3::4].max() < 0.02  # 26 and 37 ms with pads taken to be rigid
 
 
 def test_soft_pads_and_holds_in_which_misread_forces_pull_are_no_delay():
     t = np.arange(0.0, 0.8, 0.02)
     pulls = Squeeze(t, np.full(t.size, 0.02), np.zeros(t.size), -1.0 - 0.1 * t, 2e-5, 0.01)
     assert lateness([pulls], PRIOR) == lateness([], PRIOR) == Lateness()
-    own = [whole_grip(seed=i, compliance=1.6 * COMPLIANCE) for i in range(4)]
-    assert not lateness(own, PRIOR).late
+    assert not lateness([whole_grip(seed=i, compliance=1.6 * COMPLIANCE) for i in range(4)], PRIOR).late
 
 
 @pytest.mark.parametrize("shift", [-0.003, 0.003])
@@ -97,29 +100,20 @@ def test_a_small_delay_leaves_both_ends_of_a_contact(shift):
     assert fit_slope(load, place, s.sd)[0] == pytest.approx(2.5e-4, rel=0.1)
 
 
-def world(**effects):
-    _, task = scene()
-    (judged,) = trials_of(World("", Cell(rate=50.0), effects=effects), [70001])
-    (found,) = segment([judged.trial], task, judged.rig)
-    return found, np.array([s.start for s in found.spans[1:]]) - judged.boundaries
-
-
 def test_recorded_lag_is_found_and_said_and_healthy_forces_are_on_time():
-    found, residual = world(force_lag={"delay": 0.12})
+    late = World("", Cell(rate=50.0), effects={"force_lag": {"delay": 0.12}})
+    ((found, residual),) = segmented(late, 70001)
     assert "come late" in found.remarks[0] or "filtered" in found.remarks[0]
     assert np.median(np.abs(residual)) < 0.012
-    found, residual = world()
+    ((found, residual),) = segmented(replace(late, effects={}), 70001)
     assert found.remarks == () and np.median(np.abs(residual)) < 0.004
 
 
 def test_pads_under_filtered_forces_are_read_off_whole_grips():
-    _, task = scene()
     filtered = World("", effects={"force_lowpass": {"time_constant": 0.03}})
-    for judged in trials_of(filtered, [78206, 78207]):
-        (found,) = segment([judged.trial], task, judged.rig)
-        ends = np.array([s.start for s in found.spans[1:]])
+    for found, residual in segmented(filtered, 78206, 78207):
         # Stretches of forces that are late made the pads twice as soft, and releases 30 ms late.
-        assert np.abs(ends - judged.boundaries).max() < 0.015 and "filtered" in found.remarks[0]
+        assert np.abs(residual).max() < 0.015 and "filtered" in found.remarks[0]
 
 
 def test_reading_again_undoes_what_was_found_and_smears_no_jump():
@@ -175,7 +169,7 @@ def whole_grip(delay=0.0, constant=0.0, step=0.02, seed=0, compliance=COMPLIANCE
 @pytest.mark.parametrize(("delay", "constant", "step"), [
     *((delay, 0.0, step) for delay in (0.03, 0.06, 0.2) for step in (0.02, 0.05)), (0.0, 0.03, 0.02),
     (0.0, 0.06, 0.02)])  # fmt: skip
-def test_a_delay_or_a_filter_is_found_and_they_are_told_apart(delay, constant, step):
+def test_a_delay_or_a_filter_is_found_and_they_are_distinguished(delay, constant, step):
     found = lateness([whole_grip(delay, constant, step, seed=i) for i in range(4)], PRIOR)
     assert found.late and found.filter == (constant > 0)
     assert found.delay == pytest.approx(delay + constant, abs=0.006 + 0.2 * constant * (constant > 0))

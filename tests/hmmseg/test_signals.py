@@ -6,13 +6,13 @@ import jax
 import numpy as np
 import pandas as pd
 import pytest
-from hand_signals import signals_of
+from demo_recordings import RIG, TRIALS
+from hand_signals import JOINTED, signals_of
 from refusals import refused
 from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter, savgol_filter
 
 from experiments.worlds import WORLDS, scene, trials_of
-from hmmseg import example_folder
 from hmmseg.contact.equations import rolled_offset, turned
 from hmmseg.hand.kinematics import forward, inverse, joint_velocity, require_reach, tip_velocity
 from hmmseg.hand.read import read_trial
@@ -60,9 +60,6 @@ def rolling_trial(number: int, angle: float, world: str = "50 Hz") -> tuple[Tria
     return replace(judged.trial, channels=c | {ROLL: roll}), rig, b
 
 
-FINGERS = {"1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
-           "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]}}  # fmt: skip
-JOINTED = parse_rig({"fingers": FINGERS, "noise": {"angle": 2e-4, "velocity": 0.03, "force": 0.012}})
 CARTESIAN = parse_rig({"noise": {"position": 1e-4, "velocity": 0.01, "force": 0.02}})
 
 
@@ -143,12 +140,6 @@ def test_angles_and_velocities_of_tips_are_inverse_and_agree_with_jax(number):
     np.testing.assert_allclose(by_jax, speed, atol=1e-13)
 
 
-def _trial() -> tuple[Trial, Rig]:
-    folder = example_folder()
-    rig = Rig.read(folder / "rig.toml")
-    return Trial.read(folder / "trial_01.csv", rig), rig
-
-
 def _with_differences(trial: Trial, over: int) -> Trial:
     channels = dict(trial.channels)
     for name in ("q11", "q12", "q21", "q22"):
@@ -159,20 +150,18 @@ def _with_differences(trial: Trial, over: int) -> Trial:
 
 @pytest.mark.parametrize("over", [1, 2, 3])
 def test_velocities_that_repeat_the_positions_are_replaced_by_central_differences(over):
-    trial, rig = _trial()
-    late = _with_differences(trial, over)
-    found = timely(task_space(late, rig), late)
+    late = _with_differences(TRIALS[0], over)
+    found = timely(task_space(late, RIG), late)
     assert found.derived
-    truth, raw = task_space(trial, rig), task_space(late, rig)
+    truth, raw = task_space(TRIALS[0], RIG), task_space(late, RIG)
     moving = slice(5, -5)
     error = [np.sqrt(np.mean((s.vy - truth.vy)[moving] ** 2)) for s in (found, raw)]
     assert error[0] < 0.6 * error[1]
 
 
 def test_velocities_of_their_own_stay_and_rates_beside_a_kink_are_of_their_own_side():
-    trial, rig = _trial()
-    signals = task_space(trial, rig)
-    assert timely(signals, trial) is signals
+    signals = task_space(TRIALS[0], RIG)
+    assert timely(signals, TRIALS[0]) is signals
     still = np.zeros(50)  # positions that never change prove nothing
     assert not late_differences(np.arange(50) * 0.05, still, still)
     t = np.arange(40) * 0.05
@@ -184,11 +173,8 @@ def test_velocities_of_their_own_stay_and_rates_beside_a_kink_are_of_their_own_s
     assert rates[:, 5:-5].std() == pytest.approx(noise, rel=0.03)
 
 
-CHANNELS = ("x1", "y1", "vx1", "vy1", "fx1", "fy1", "x2", "y2", "vx2", "vy2", "fx2", "fy2")
-
-
 def made_signals(t, rng, sd=0.1):
-    columns = {name: rng.normal(size=t.size) * sd for name in CHANNELS}
+    columns = {name: rng.normal(size=t.size) * sd for name in CARTESIAN_CHANNELS}
     return signals_of(t, sd, **columns, sd_x=sd, sd_y=sd, sd_vx=sd, sd_vy=sd)
 
 
@@ -200,7 +186,7 @@ def test_noise_is_found_beneath_a_smooth_signal_and_of_means_and_distances():
     assert noise_sd(stepped) == pytest.approx(0.01, rel=0.1)
     rig = Rig(noise=Noise(position=3e-5, velocity=4e-3, force=0.01), fingertip=Fingertip())
     t = np.arange(40) * 0.05
-    trial = Trial("made.csv", t, {name: np.sin(t) for name in CHANNELS})
+    trial = Trial("made.csv", t, {name: np.sin(t) for name in CARTESIAN_CHANNELS})
     f = features(task_space(trial, rig), rig)
     np.testing.assert_allclose(f.sd_y, 3e-5 / np.sqrt(2))
     np.testing.assert_allclose(f.sd_d, 3e-5 * np.sqrt(2))

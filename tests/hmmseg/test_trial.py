@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
+from hand_signals import JOINTED
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refused
@@ -22,10 +23,6 @@ from hmmseg.io.task import GROUND, BlockTask, Move, SequenceTask, parse_task, re
 from hmmseg.io.trial import CARTESIAN_CHANNELS, JOINT_CHANNELS
 from hmmseg.io.units import UNITS, known_unit, measures, si_factor, unit_in_name
 
-FINGERS = {"1": {"base": [0.05, 0.17], "links": [0.12, 0.11]},
-           "2": {"base": [0.21, 0.17], "links": [0.1, 0.12]}}  # fmt: skip
-JOINTED = parse_rig({"fingers": FINGERS, "noise": {"angle": 2e-4, "velocity": 0.03, "force": 0.012}})
-CARTESIAN = parse_rig({"noise": {"position": 1e-4, "velocity": 0.01, "force": 0.02}})
 PLAIN = SequenceTask(("a", "b"))
 THEIRS = {"t": ("stamp", "ns", 1, 0.0), "x1": ("left x [mm]", "mm", -1, 0.25), "y1": ("ly", "cm", 1, 0.0),
           "vx1": ("lvx", 1e-3, -1, 0.0), "fx1": ("lfx", "mN", -1, 0.1),

@@ -340,24 +340,13 @@ def test_the_same_seed_gives_the_same_digits(name, lab):
     assert files(lab) == first
 
 
-HMMSEG = Path(sys.executable).with_name("hmmseg")
 TASK = '[objects.block1]\non = "ground"\n[[moves]]\nobject = "block1"\nto = "ground"\n'
-
-
-def process(*args: str, **more) -> subprocess.CompletedProcess:
-    return subprocess.run([HMMSEG, *args], capture_output=True, text=True, check=False, **more)
-
-
-@pytest.fixture
-def task(tmp_path) -> Path:
-    path = tmp_path / "task.toml"
-    path.write_text(TASK)
-    return path
 
 
 def test_processes_say_one_line_of_bad_input_and_show_the_traceback_of_a_bug(tmp_path):
     (tmp_path / "bad.toml").write_text(TASK.replace('to = "ground"', 'to = "table"'))
-    done = process("decompose", "bad.toml", "--json", "out.json", cwd=tmp_path)
+    command = [Path(sys.executable).with_name("hmmseg"), "decompose", "bad.toml", "--json", "out.json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("bad.toml: move 1: unknown destination 'table'; expected one of block1, ")
     assert done.stderr.count("\n") == 1 and os.listdir(tmp_path) == ["bad.toml"]
@@ -420,8 +409,9 @@ def test_usage_at_fault(capsys, args, line):
     assert (out, err.count("\n")) == ("", 1) and err.startswith(line)
 
 
-def test_task_and_rig_are_found_beside_the_trials(tmp_path, task):
-    trial, rig = tmp_path / "trial.csv", tmp_path / "rig.toml"
+def test_task_and_rig_are_found_beside_the_trials(tmp_path):
+    task, trial, rig = tmp_path / "task.toml", tmp_path / "trial.csv", tmp_path / "rig.toml"
+    task.write_text(TASK)
     trial.write_text("t\n")
     assert find_inputs([trial], None, None) == (task, None)
     rig.write_text("rate = 50.0\n")

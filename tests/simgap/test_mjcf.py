@@ -90,10 +90,10 @@ URDF = """<robot name="swing">
 
 @pytest.fixture
 def files(tmp_path):
-    def write(xml: str = XML, described: str = MAP):
-        (tmp_path / "swing.xml").write_text(xml)
+    def write(xml: str = XML, described: str = MAP, name: str = "swing.xml"):
+        (tmp_path / name).write_text(xml)
         (tmp_path / "map.toml").write_text(described)
-        return tmp_path / "swing.xml", tmp_path / "map.toml"
+        return tmp_path / name, tmp_path / "map.toml"
 
     return write
 
@@ -102,6 +102,17 @@ def loaded(files, *candidates: str):
     found, t = load_mjcf(*files(), candidates), np.arange(0, 2, 0.01)
     log = Recording("a.csv", t, {"q": 0.1 * np.cos(6.9 * t), "u": np.zeros(t.size)})
     return found, log, found.effects([log])
+
+
+def stepped(model, commands, nstep=1, rate=0.0, given="ctrl"):
+    """Positions and rates (n, 2 n_q) before each step of a loop of MuJoCo given these commands."""
+    data, run = mujoco.MjData(model), []
+    data.qvel[:] = rate
+    for command in commands:
+        run.append([*data.qpos, *data.qvel])
+        getattr(data, given)[:] = command
+        mujoco.mj_step(model, data, nstep)
+    return np.array(run)
 
 
 def read_back(found, folder, angle, command):
@@ -211,7 +222,7 @@ def test_a_wheel_turns_as_often_as_it_does_if_its_unit_is_stated(files, tmp_path
         refused(r"expected unit = .deg. in the map", found.read, tmp_path / "a.csv")
 
 
-def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_told(files, tmp_path):
+def test_goals_in_degrees_turns_and_commands_beyond_their_range_are_reported(files, tmp_path):
     servo = '<position name="m" joint="pivot" kp="9" ctrlrange="-0.5 0.5" ctrllimited="true"/>'
     goals = MAP.replace('unit = "Nm"', 'unit = "rad"')
     found = load_mjcf(*files(XML.replace('<motor name="m" joint="pivot"/>', servo), goals))
@@ -362,16 +373,10 @@ def test_the_gain_of_any_actuator_is_its_strength_or_how_stiffly_it_follows(file
 
 def test_lines_are_those_of_a_loop_that_sets_a_command_and_makes_a_step(files):
     found, run = turning(files)
-    model = found.simulator.model
-    data, h = mujoco.MjData(model), float(model.opt.timestep)
-    data.qpos[:], data.qvel[:] = 0.0, 1.8
-    t, asked = np.arange(0, 2, 0.01), []
-    for k in range(round(1.99 / h) + 1):
-        asked.append(float(data.qpos[0]))
-        data.ctrl[:] = np.interp(k * h, t, 0.3 * np.sin(6 * t))
-        mujoco.mj_step(model, data)
-    np.testing.assert_allclose(run(option__hold=1.0), np.interp(t, h * np.arange(len(asked)), asked),
-                               atol=1e-5)  # fmt: skip
+    model, t = found.simulator.model, np.arange(0, 2, 0.01)
+    times = model.opt.timestep * np.arange(round(1.99 / model.opt.timestep) + 1)
+    asked = stepped(model, np.interp(times, t, 0.3 * np.sin(6 * t)), rate=1.8)[:, 0]
+    np.testing.assert_allclose(run(option__hold=1.0), np.interp(t, times, asked), atol=1e-5)
     assert np.abs(run(option__hold=1.0, option__late=0.5) - run(option__hold=1.0)).max() > 1e-4
 
 
@@ -394,17 +399,13 @@ def test_smoothed_commands_are_means_and_play_lags_at_turns(files):
 def test_commands_that_follow_a_curve_between_samples_are_in_reach(files):
     """A loop at 1 kHz whose commands are logged at 100 Hz: lines lie off its curve, always to one side."""
     wanted = lambda t: 0.3 * np.sin(20 * t)  # noqa: E731
-    found, run = turning(files, u=wanted(np.arange(0, 2, 0.01)))
+    t = np.arange(0, 2, 0.01)
+    found, run = turning(files, u=wanted(t))
     model = found.simulator.model
-    data, h = mujoco.MjData(model), float(model.opt.timestep)
-    data.qvel[:], told = 1.8, []
-    for k in range(round(1.99 / h) + 1):
-        told.append(float(data.qpos[0]))
-        data.ctrl[:] = wanted(k * h)
-        mujoco.mj_step(model, data)
-    told = np.interp(np.arange(0, 2, 0.01), h * np.arange(len(told)), told)
+    times = model.opt.timestep * np.arange(round(1.99 / model.opt.timestep) + 1)
+    true = np.interp(t, times, stepped(model, wanted(times), rate=1.8)[:, 0])
     low = found.simulator.parameters["option.smooth"].low
-    lines, curve = (np.abs(run(option__hold=1.0, option__smooth=s) - told)[1:-2].max() for s in (0.0, low))
+    lines, curve = (np.abs(run(option__hold=1.0, option__smooth=s) - true)[1:-2].max() for s in (0.0, low))
     assert curve < 0.1 * lines
     np.testing.assert_array_equal(run(option__smooth=low), run())  # steps have none
 
@@ -427,13 +428,10 @@ def test_a_joint_that_follows_starts_as_far_off_its_tie_as_loads_have_it(files, 
     columns = '[columns.w]\njoint = "left"\n[columns.u]\nactuator = "servo"\nunit = "m"\n'
     found, model = load_mjcf(*files(TIED, columns)), mujoco.MjModel.from_xml_string(TIED)
     model.eq_solref[:, 0] = tie
-    data, t, run = mujoco.MjData(model), np.arange(0, 1, 0.01), []
+    t = np.arange(0, 1, 0.01)
     u = 0.05 * np.sin(6 * t)
-    for goal in u:
-        run.append((*data.qpos, *data.qvel))
-        data.ctrl[:] = goal
-        mujoco.mj_step(model, data, nstep=5)
-    log = Recording("a.csv", t, {"w": np.array(run)[:, 0], "u": u})
+    run = stepped(model, u, 5)
+    log = Recording("a.csv", t, {"w": run[:, 0], "u": u})
     found.effects([log])
     left, right, rate, other = run[60]
     job = Job({}, log.window(60, 90), {"w": left, "w_rate": rate})
@@ -464,26 +462,17 @@ def test_a_joint_pushed_on_past_a_stop_starts_where_it_came_to_rest(files):
 
 
 @pytest.fixture
-def urdf(tmp_path):
-    def write(described: str = MAP.replace('"m"', '"pivot"')):
-        (tmp_path / "swing.urdf").write_text(URDF)
-        (tmp_path / "map.toml").write_text(described)
-        return tmp_path / "swing.urdf", tmp_path / "map.toml"
-
-    return write
+def urdf(files):
+    torques = MAP.replace('"m"', '"pivot"')
+    return lambda described=torques: files(URDF, described, "swing.urdf")
 
 
 def test_a_column_of_torques_drives_a_urdf(urdf):
     found, t = load_mjcf(*urdf()), np.arange(0, 1, 0.01)
     log = Recording("a.csv", t, {"q": np.zeros(t.size), "u": 0.3 * np.sin(5 * t)})
     more = found.effects([log])
-    values, asked = {n: p.nominal for n, p in found.simulator.parameters.items()}, []
-    model = mujoco.MjModel.from_xml_string(URDF)
-    data = mujoco.MjData(model)
-    for torque in log["u"]:
-        asked.append(float(data.qpos[0]))
-        data.qfrc_applied[:] = torque
-        mujoco.mj_step(model, data, nstep=5)
+    values = {n: p.nominal for n, p in found.simulator.parameters.items()}
+    asked = stepped(mujoco.MjModel.from_xml_string(URDF), log["u"], 5, given="qfrc_applied")[:, 0]
     got = found.simulator.simulate(values, log, {"q": 0.0, "q_rate": 0.0})["q"]
     np.testing.assert_allclose(got, asked, atol=1e-6)
     effects = effects_of(found.simulator, [log], more)
@@ -532,11 +521,7 @@ def test_what_only_slides_is_held_as_softly_as_in_mujoco_s_own_run(files, name, 
     begun = {"l": 0.0, "l_rate": 0.0, "r": 0.0, "r_rate": 0.0}
     read = found.simulator.simulate({name: value} if name else {}, log, begun)
     model = mujoco.MjModel.from_xml_string(xml.replace(*stated) if stated else xml)
-    data, own = mujoco.MjData(model), []
-    for u in log["u"]:
-        own.append(data.qpos.copy())
-        data.ctrl[0] = u
-        mujoco.mj_step(model, data)
+    own = stepped(model, log["u"])[:, :2]
     assert np.abs(np.column_stack([read["l"], read["r"]]) - own).max() < 1e-9
 
 
@@ -569,8 +554,7 @@ def test_what_is_uncertain_is_fitted_along_and_what_is_measured_as_the_map_says(
 
     def made(described: str):
         again = load_mjcf(*files(described=described + MAP))
-        more = again.effects([log])
-        return effects_of(again.simulator, [log], more)
+        return effects_of(again.simulator, [log], again.effects([log]))
 
     usual = effects_of(found.simulator, [log], more)
     stated = made('uncertain = ["joint:*.damping"]\n[sd]\n"body:bob.mass" = 0.002\n')

@@ -78,8 +78,7 @@ def test_evidence_is_the_integral_over_the_slab(drawn, name):
 
 def test_bounds_hold_and_many_sets_are_as_each_alone(drawn):
     columns, residual, fold = drawn
-    bounded = sets_of(columns, -residual, fold, low=0.0)
-    assert bounded.fit(("a",), 0).x[1] == 0.0
+    assert sets_of(columns, -residual, fold, low=0.0).fit(("a",), 0).x[1] == 0.0
     sets = sets_of(*drawn)
     every = [*neighbours(("a",), NAMES), *pairs((), NAMES)]
     together = sets.scores(every, 0)
@@ -128,8 +127,7 @@ def test_discrepancies_are_found_and_windows_that_are_off_by_themselves_leave_th
     wide = cov.outliers(cov.whitener(cov.estimate(rows)), rows)
     assert {*wide} == {2} and wide[2] == pytest.approx(9.0, rel=0.4)
     for known in (found, {"p": 7.0, "q": 0.1}):  # wherever the search begins
-        again = cov.estimate(rows, wide, known)
-        assert again == pytest.approx(cov.estimate(rows, wide), rel=0.01)
+        assert cov.estimate(rows, wide, known) == pytest.approx(cov.estimate(rows, wide), rel=0.01)
     assert cov.estimate(rows, wide, {}) == {}
 
 
@@ -207,7 +205,7 @@ def test_log_odds_count_less_where_residuals_vary_more_than_their_discrepancy():
     assert predicts_better(gain) and not predicts_better(gain, 1.6)
 
 
-def test_what_replaces_a_cause_is_told_although_it_could_replace_a_small_effect_too():
+def test_what_replaces_a_cause_is_reported_although_it_could_replace_a_small_effect_too():
     sets = [partly(FittedSet, names=names, score=score)
             for names, score in [(("load", "hold", "hum"), 0.0), (("load", "hold", "lag"), -1.0),
                                  (("load", "lag", "hum"), -9.0),
@@ -275,8 +273,7 @@ def test_logs_are_repeats_where_commands_are_alike_and_count_each_where_the_mode
     assert made.among(of_three).repeats() == [2, 2, 1]
     rng = np.random.default_rng(1)
     made = composed(np.zeros((LOGS, TIMES.size)), rng)
-    linear = linearise(made, {}, ["size"])
-    cov = covariances(made, linear)
+    cov = covariances(made, linearise(made, {}, ["size"]))
     least = cov.whitener(Discrepancy({"y": 1e-9}))
     assert least.half_log_det == pytest.approx(cov.whitener().half_log_det)
 
@@ -337,8 +334,7 @@ def test_brief_touches_count_but_breaks_do_not_and_what_slows_down_does_not_rest
     t = np.arange(12) * 0.01
     pair, none = frozenset({(0, 1)}), frozenset()
     sets = [none, none, pair, none, none, none, none, none, pair, none, pair, none]
-    told = closed(t, sets)
-    assert [bool(s) for s in told] == [bool(i in (2, 8, 9, 10)) for i in range(12)]
+    assert [bool(s) for s in closed(t, sets)] == [bool(i in (2, 8, 9, 10)) for i in range(12)]
     t = np.arange(0, 1.0, 0.01)
     log = Recording("log.csv", t, {"q": np.where(t < 0.5, 1 - np.exp(-t / 0.1), 1 - np.exp(-5))})
     rests, rate = resting(log, {"q": 1.0}), np.exp(-t / 0.1) / 0.1
@@ -371,7 +367,7 @@ def dropped(tmp_path_factory):
     return loaded.simulator, loaded.read(folder / "log.csv")
 
 
-def test_flight_and_contact_are_told_apart(dropped):
+def test_flight_and_contact_are_distinguished(dropped):
     simulator, log = dropped
     times, what = simulator.contact_states(log)
     fall, first = np.sqrt(2 * 0.45 / 9.81), times[what.index(frozenset({(0, 1)}))]
@@ -411,8 +407,7 @@ def test_a_fall_alone_tells_the_scale_and_impacts_are_no_measurement(dropped):
     simulator, log = dropped
     every = readouts.candidates(Setting(simulator, [log]))
     (scale,) = [e for e in every if e.name == "readout.scale"]
-    noise = dict.fromkeys(POSE, 1e-4)
-    composed = Composed.of(simulator, [log], {scale.name: scale}, noise, 0.2)
+    composed = Composed.of(simulator, [log], {scale.name: scale}, dict.fromkeys(POSE, 1e-4), 0.2)
     composed = with_wobble(composed, linearise(composed, {}, [scale.name]))
     linear = linearise(composed, {}, [scale.name])
     usual = {CONTACTS: 1.0, "z, lying": 2e-2 * 0.05}
@@ -436,9 +431,7 @@ def test_a_body_at_rest_is_compared_where_it_lies_which_differs_from_time_to_tim
     np.testing.assert_allclose(settled / base.rows[still][20:], 0.97, atol=2e-3)
     calm = composed.calm()
     assert {w.regime for w in calm.windows} == {FLIES, RESTS} and calm.calm() is calm
-    linear = linearise(composed, {}, [])
-    cov = covariances(composed, linear)
-    for block in cov.blocks:
+    for block in covariances(composed, linearise(composed, {}, [])).blocks:
         lying = {n: s for n, s in block.sources.items() if n.endswith(LIES)}
         assert len(lying) == (len(POSE) if composed.windows[block.window].regime == RESTS else 0)
         for name, source in lying.items():
