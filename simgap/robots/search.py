@@ -149,11 +149,7 @@ class Search:
     def run(self, tell: Progress, note: Progress = silent) -> FittedSet:
         """The best set, searched forwards from nothing and, where that leaves a gap, backwards from the
         calibration; `note`: told at once where the gap is and how large."""
-        best = self.nothing()
-        size = {n: v / best.noise**0.5 for n, v in best.linear.rows.rms(best.squares**0.5, best.fine).items()}
-        each = ", ".join(f"{n} {v:.3g}" for n, v in sorted(size.items(), key=lambda one: -one[1]))
-        note(f"the model as it came misses, in times the noise: {each}")
-        best = self._from(best, tell)
+        best = self._from(self.nothing(note), tell)
         if best.squares[best.fine].mean() > LEAVES * best.noise:
             tell("from the calibration")
             self.columns.clear()
@@ -193,15 +189,28 @@ class Search:
             return known
         return self.fit(rest, without(found.point, out), [found.whiten], near=found)
 
-    def nothing(self) -> FittedSet:
-        """The empty set: only what is fitted along."""
+    def nothing(self, note: Progress = silent) -> FittedSet:
+        """The empty set: only what is fitted along; `note`: as in `run`."""
         point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
-        if any(w.regime == STRIKES for w in self.composed.windows):
-            every, base = linearise(self.composed, point, self.along), base_at(self.composed, point)
-            every = every.with_moved(self._rolled_out(self.composed, base, self.wanted))
-            self.composed = with_wobble(self.composed, every)
         linear = linearise(self.composed.moved(point), point, self.along)
-        return self.fit((), point, [covariances(self.composed, linear).whitener()])
+        whiten = covariances(self.composed, linear).whitener()
+        note(self._told(linear, whiten))
+        if any(w.regime == STRIKES for w in self.composed.windows):
+            every = self._rolled_out(self.composed, base_at(self.composed, point), self.wanted)
+            self.composed = with_wobble(self.composed, linear.with_moved(every))
+        return self.fit((), point, [whiten])
+
+    def _told(self, linear: Linear, whiten: Whitener) -> str:
+        """Where the gap of the model as it came is and how large, with what is fitted along at its best along
+        straight lines."""
+        effects, left = self.composed.effects, np.nan_to_num(linear.residual)
+        at = point_of(effects, self._sets(linear, [whiten], ()).fit((), 0), (), self.along)
+        for name, theta in at.items():
+            moved = linear.moved[name]
+            left = left - np.nan_to_num(moved.jacobian) @ (np.array([*theta.values()]) - moved.at)
+        rms = linear.rows.rms(whiten(left), np.isfinite(linear.residual))
+        each = ", ".join(f"{n} {v:.3g}" for n, v in sorted(rms.items(), key=lambda one: -one[1]))
+        return f"the model as it came misses, in times the noise: {each}"
 
     def _from(self, best: FittedSet, tell: Progress) -> FittedSet:
         """The best set that steps lead to."""

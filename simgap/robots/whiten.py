@@ -23,7 +23,7 @@ factor turns rows into innovations: what each says beyond those before it in its
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -61,28 +61,36 @@ NONE = Discrepancy()
 
 @dataclass(frozen=True)
 class Source:
-    """A discrepancy's covariance (k, k) at s = 1 among some `rows` (k,) of a block, or its variances (k,)
-    where it correlates none."""
+    """A discrepancy at s = 1 among some `rows` (k,) of a block: a `factor` F (k, r) of its covariance F F',
+    or standard deviations (k,) where it correlates none."""
 
     rows: np.ndarray
-    covariance: np.ndarray
-
-    def add(self, total: np.ndarray, variance: float) -> None:
-        """Add it to a block's covariance, in place."""
-        across = self.rows if self.covariance.ndim == 1 else self.rows[:, None]
-        total[across, self.rows] += variance * self.covariance
+    factor: np.ndarray
 
     def over(self, sd: np.ndarray) -> Source:
         """The same in units of the block's rows' noise, `sd` (n,)."""
         mine = sd[self.rows]
-        units = mine**2 if self.covariance.ndim == 1 else np.outer(mine, mine)
-        return Source(self.rows, self.covariance / units)
+        return Source(self.rows, self.factor / (mine if self.factor.ndim == 1 else mine[:, None]))
 
     def along(self, directions: np.ndarray, diagonal: bool = False) -> np.ndarray:
         """Its covariance (m, m) along the columns of `directions` (n, m), or the variances (m,) alone."""
         mine = directions[self.rows]
-        told = self.covariance[:, None] * mine if self.covariance.ndim == 1 else self.covariance @ mine
-        return np.sum(mine * told, 0) if diagonal else mine.T @ told
+        told = self.factor[:, None] * mine if self.factor.ndim == 1 else self.factor.T @ mine
+        return np.sum(told**2, 0) if diagonal else told.T @ told
+
+
+def _with(variance: np.ndarray, start: np.ndarray, sources: Iterable[tuple[Source, float]]) -> np.ndarray:
+    """The covariance (n, n) of noise, a start and sources, each with its s."""
+    every, out = [start], np.diag(variance)
+    for source, s in sources:
+        if source.factor.ndim == 1:
+            out[source.rows, source.rows] += (s * source.factor) ** 2
+        elif source.rows.size == variance.size:
+            every.append(s * source.factor)
+        else:
+            out[source.rows[:, None], source.rows] += (s**2 * source.factor) @ source.factor.T
+    both = np.concatenate(every, 1)
+    return out + both @ both.T
 
 
 @dataclass(frozen=True)
@@ -104,11 +112,8 @@ class Block:
 
     def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
         """The rows' covariance (n, n) with a discrepancy."""
-        out = np.diag(self.variance) + self.start @ self.start.T
-        for name, s in discrepancy.items():
-            if name in self.sources:
-                self.sources[name].add(out, s**2)
-        return out
+        mine = [(self.sources[n], s) for n, s in discrepancy.items() if n in self.sources]
+        return _with(self.variance, self.start, mine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +181,7 @@ class Covariances:
         if known is not None:
             smooth, names = smooth.among([names.index(n) for n in known]), tuple(known)
             x = 2 * np.log(np.array([*known.values()]))
-        plain = smooth.cost(np.full(len(names), -np.inf), left, rest)[0]
+        plain = smooth.value(np.full(len(names), -np.inf), left, rest)
         while names:
             bounds = [(v - 20.0, v + 12.0) for v in x]
             given: dict[str, Any] = {"args": (left, rest), "jac": True, "bounds": bounds, "options": CLOSE}
@@ -184,7 +189,7 @@ class Covariances:
             ended = [minimize(smooth.cost, one, method="L-BFGS-B", **given) for one in begun]
             done = min(ended, key=lambda one: one.fun)
             each = np.where(np.eye(len(names), dtype=bool), -np.inf, done.x)
-            without = [smooth.cost(one, left, rest)[0] - done.fun for one in each]
+            without = [smooth.value(one, left, rest) - done.fun for one in each]
             if plain - done.fun >= WORTH and min(without) >= WORTH:
                 return {n: float(np.exp(v / 2)) for n, v in zip(names, done.x, strict=True)}
             # What is next to nothing goes at once, else the source that is needed least.
@@ -288,11 +293,10 @@ class _Smooth:
         for block in blocks:
             sd = np.sqrt(block.variance)
             start = block.start / sd[:, None]
-            both = start @ start.T / max(float(np.sum(start**2)), 1e-300)
             each = [block.sources[n].over(sd) if n in block.sources else None for n in names]
-            for one in each:
-                if one is not None and one.covariance.ndim == 2 and one.rows.size > 1:
-                    one.add(both, 1 / max(float(np.trace(one.covariance)), 1e-300))
+            smooth = [one for one in each if one is not None and one.factor.ndim == 2 and one.rows.size > 1]
+            sizes = [max(float(np.sum(f**2)), 1e-300) ** -0.5 for f in (start, *(o.factor for o in smooth))]
+            both = _with(np.zeros(sd.size), sizes[0] * start, zip(smooth, sizes[1:], strict=True))
             count = min(sd.size, SMOOTH * np.unique(block.channel).size)
             b = np.linalg.eigh(both)[1][:, -count:]
             other = np.eye(sd.size) - b @ b.T
@@ -340,8 +344,17 @@ class _Smooth:
         """The same with some of the sources, by number."""
         return replace(self, source=self.source[kept], white=self.white[kept])
 
+    def value(self, x: np.ndarray, left: np.ndarray, rest: np.ndarray) -> float:
+        """Minus the log likelihood at log variances (K,) of the sources."""
+        variance = np.exp(x)
+        factors = [_factored(one) for one in self.plain + np.tensordot(variance, self.source, 1)]
+        square = sum(float(np.sum(solved_by(f, y) ** 2)) for f, y in zip(factors, left, strict=True))
+        own = 1 + variance @ self.white
+        half = sum(float(np.log(np.diag(f)).sum()) for f in factors) + 0.5 * float(self.share @ np.log(own))
+        return half + 0.5 * square + 0.5 * float(np.sum(rest**2 / own))
+
     def cost(self, x: np.ndarray, left: np.ndarray, rest: np.ndarray) -> tuple[float, np.ndarray]:
-        """Minus the log likelihood at log variances (K,) of the sources, and its gradient (K,)."""
+        """The same, and its gradient (K,)."""
         variance = np.exp(x)
         whole = self.plain + np.tensordot(variance, self.source, 1)
         inverse, half_logs = _inverted(whole)
@@ -436,20 +449,19 @@ def _sources(
         t = since[mine]
         rate = linear.starts.get(f"{name}{RATE}")
         if regime == RESTS and name in linear.starts:
-            out[f"{name}, {LIES}"] = Source(np.flatnonzero(mine), np.ones((t.size, t.size)))
+            out[f"{name}, {LIES}"] = Source(np.flatnonzero(mine), np.ones((t.size, 1)))
             continue
         key = name if regime == FLIES else f"{name}, {regime}"
         if rate is not None and regime == STRIKES:
             response = _propagated(t, since, channel, rate[block])
             moved = every if response.any() else every[:0]
-            forces = np.exp(-np.abs(t[:, None] - t) / TAU)
-            out[key] = Source(moved, response[moved] @ forces @ response[moved].T)
+            out[key] = Source(moved, response[moved] @ _integrated(t.tobytes(), 0))
         else:
             times = INTEGRALS[kinds[name]] if linear.starts else 0
             out[key] = Source(np.flatnonzero(mine), _integrated(t.tobytes(), times))
     if wobble is not None and regime == STRIKES:
-        out[CONTACTS] = Source(every, wobble[block] @ wobble[block].T)
-    out[CLOCK] = Source(every, linear.rates[block] ** 2)
+        out[CONTACTS] = Source(every, wobble[block[0] : block[-1] + 1])
+    out[CLOCK] = Source(every, linear.rates[block])
     return out
 
 
@@ -467,12 +479,13 @@ def _propagated(t: np.ndarray, since: np.ndarray, channel: np.ndarray, kick: np.
 
 @lru_cache(maxsize=512)
 def _integrated(since: bytes, times: int) -> np.ndarray:
-    """Covariance (n, n) of unmodelled accelerations, integrated `times` times; cached, as most windows are
-    alike."""
+    """A factor (n, n) of the covariance of unmodelled accelerations, each what is left of the one before and
+    something new, integrated `times` times; cached, as most windows are alike."""
     t = np.frombuffer(since)
-    out = np.exp(-np.abs(t[:, None] - t) / TAU)
+    new = np.sqrt(-np.expm1(-2 * np.diff(t, prepend=-np.inf) / TAU))
+    out = np.tril(np.exp(-np.abs(t[:, None] - t) / TAU)) * new
     for _ in range(times):
-        out = _integral(t) @ out @ _integral(t).T
+        out = _integral(t) @ out
     return out
 
 

@@ -273,7 +273,7 @@ def test_delayed_commands_step_when_they_are_carried_out(files):
     window = late(log, {"delay": 0.0123}).window(40, 80)
     times = np.arange(0, float(window.t[-1] - window.t[0]), 1e-3)
     since = np.array([window.t - window.t[0]])
-    held = _carried_out([window], Held(since, times), 0.0)
+    held = Held(_carried_out([window], since, 0.0), times)
     acted = held(np.array([_commanded(window, "u")]))[0]
     fine = window.t[0] + times[:, None] + 1e-3 * (np.arange(200) + 0.5) / 200
     asked = log["u"][np.searchsorted(log.t, fine - 0.0123, side="right") - 1].mean(1)

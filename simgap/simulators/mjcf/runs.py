@@ -126,6 +126,7 @@ class Runs:
     driven: Mapping[str, int]
     free: Mapping[int, Mapping[str, str]]
     _sides: dict[Any, Any] = field(default_factory=dict, repr=False)
+    _held: dict[Any, Any] = field(default_factory=dict, repr=False)
     _ran: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     def __call__(
@@ -157,15 +158,22 @@ class Runs:
         span = max(float(log.t[-1] - log.t[0]) for log in logs)
         times = np.arange(int(np.ceil(span / h - 1e-9)) + 2) * h
         side = self._side(logs, times, kept)
-        control = np.zeros((len(logs), times.size, self.model.nu))
         line, late, smooth = (dict(changed).get(name, 0.0) for name in (HOLD, LATE, SMOOTH))
         smooth = max(smooth, line * smooth)  # steps have no curve
         # A loop that sets a command and makes a step has the line where the step begins, not its mean.
-        held = _carried_out(logs, side[0], (late + 0.5 * line) * h)
-        for column, place in self.driven.items():
-            asked = np.array([_commanded(log, column) for log in logs])
-            asked[:, 1:-1] += 0.5 * smooth * np.diff(asked, 2)
-            control[:, :, place] = held(asked, line)
+        since = _carried_out(logs, side[0].since, (late + 0.5 * line) * h)
+        every = [np.array([_commanded(log, column) for log in logs]) for column in self.driven]
+
+        def steps() -> np.ndarray:
+            held = side[0] if since is side[0].since else Held(since, times)
+            control = np.zeros((len(logs), times.size, self.model.nu))
+            for asked, place in zip(every, self.driven.values(), strict=True):
+                asked[:, 1:-1] += 0.5 * smooth * np.diff(asked, 2)
+                control[:, :, place] = held(asked, line)
+            return control
+
+        given = (since.tobytes(), times.size, h, line, smooth, *(asked.tobytes() for asked in every))
+        control = latest(self._held, given, steps, kept)
         return self._read(logs, self._sensed(first, control, changed, kept), side, times)
 
     def _sensed(
@@ -211,16 +219,16 @@ class Runs:
         return whole
 
 
-def _carried_out(logs: Sequence[Recording], held: Held, late: float) -> Held:
-    """How commands are held that come `late` [s], and at times of their own where logs have these."""
-    since = held.since
+def _carried_out(logs: Sequence[Recording], since: np.ndarray, late: float) -> np.ndarray:
+    """Since when (B, n) commands are held that come `late` [s], and at times of their own where logs have
+    these."""
     if ACTS in logs[0].columns:
         own = np.array([log[ACTS] - log.t[0] for log in logs])
         since = np.minimum.accumulate(np.minimum(own, since)[:, ::-1], 1)[:, ::-1]
         if f"{ACTS}next" in logs[0].columns:
             after = np.array([log[f"{ACTS}next"][-1] - log.t[0] for log in logs])
             since = np.column_stack([since, np.maximum(after, since[:, -1])])
-    return held if since is held.since and not late else Held(since + late, held.times)
+    return since + late if late else since
 
 
 def _commanded(log: Recording, column: str) -> np.ndarray:
