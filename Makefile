@@ -96,8 +96,8 @@ FRESH := experiments/results/gap_fresh.json
 DRAWN := $(BIN)/python -m experiments.gap_drawn --results build/gap_fresh --output $(FRESH)
 gap-fresh: $(INSTALLED)  ## diagnoses of labs of our own second simulator, drawn anew; fills docs/gap_results.md
 	set -e; open() { $(BIN)/python -m experiments.blind_check open --seed $$1 --cases $$2 --out build/$$1 --tiers $$3; }; \
-	  open 273201 20 healthy; open 273211 40 "single pair outside"
-	$(DRAWN) build/273201 build/273211 --run "judged once"
+	  open 273301 20 healthy; open 273311 40 "single pair outside"
+	$(DRAWN) build/273301 build/273311 --run "judged once"
 	$(BIN)/python -m experiments.write_tables
 
 blind-check: $(INSTALLED)  ## diagnose the SET of the second simulator (a folder with cases and seal) and score it; fills docs/gap_results.md
