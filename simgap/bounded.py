@@ -6,7 +6,7 @@ import numpy as np
 
 ROUNDING = 1e-12  # numerics: slopes below this share of the largest pull count as zero
 PATIENCE = 3  # numerics: exchanges of many coordinates without progress before one is exchanged at a time
-MOST = 1000  # limit: exchanges, of which rounding may need more than any number
+MOST = 1000  # limit: exchanges, which rounding may repeat for ever
 
 
 def least(

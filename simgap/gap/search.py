@@ -95,25 +95,25 @@ def best_fit(given: Problem, key: str, base: Fitted) -> Fitted:
     every = [start for u in (nominal, base.u)[: 1 + drawn] for start in starts(given, key, u)]
     ranked = sorted(((*_linear_step(given, effects, u, usual), u) for u in every), key=lambda r: r[0])
     if base.cost - ranked[0][0] < PROMISING:
-        there = fit(given, effects, ranked[0][2], 0, usual)
+        there = fit(given, effects, ranked[0][-1], 0, usual)
         if there.cost < base.cost + PROMISING:  # else the step led too far to linearise there
             return there
-    leading = [_brought_back(given, effects, u, start) for _, u, start in ranked[:LEADERS]]
+    leading = [_bring_back(given, effects, u, start, most) for _, u, most, start in ranked[:LEADERS]]
     if len(leading) > 1:
         leading = [min((fit(given, effects, u, SCREEN, usual) for u in leading), key=lambda f: f.cost).u]
     # An effect on moments may change most of how easily blocks turn in the grip.
     return fit(given, effects, fit(given, effects, leading[0], usual=usual).u)
 
 
-def _brought_back(
-    given: Problem, effects: tuple[str, ...], there: np.ndarray, start: np.ndarray
+def _bring_back(
+    given: Problem, effects: tuple[str, ...], there: np.ndarray, start: np.ndarray, most: float
 ) -> np.ndarray:
-    """Coordinates to which a linear step leads, halved back towards its start while they cost more than it.
+    """Coordinates to which a linear step leads, halved back towards its start, which costs `most`, while
+    they cost more.
 
     Some filters turn recordings into oscillations that grow without end, from where no way leads back.
     """
     mine = columns_of(given, effects)
-    most = cost_at(given, effects, start, mine)[2]
     for _ in range(HALVINGS):
         if cost_at(given, effects, there, mine)[2] <= most:
             return there
@@ -123,9 +123,9 @@ def _brought_back(
 
 def _linear_step(
     given: Problem, effects: tuple[str, ...], start: np.ndarray, usual: np.ndarray
-) -> tuple[float, np.ndarray]:
-    """Cost after one linear step of all but the last effect's gridded parameters, and the coordinates
-    there."""
+) -> tuple[float, np.ndarray, float]:
+    """Cost after one linear step of all but the last effect's gridded parameters, the coordinates there,
+    and the cost at the start."""
     fixed = [column for column, _ in _gridded(given, effects[-1])]
     low, high = slots(given.num_common)[1]
     columns = np.array([c for c in columns_of(given, effects) if c not in fixed])
@@ -140,7 +140,7 @@ def _linear_step(
     left = now.residual + now.jacobian @ (there[columns] - u[columns])
     own = there[: given.num_common]
     cost = 0.5 * float(given.nuisances.product(left, left)) + now.doubts + 0.5 * float(own @ own)
-    return cost, there
+    return cost, there, now.cost
 
 
 # Realignment after correction for an effect: forces displaced by a fault may look like another task.

@@ -194,13 +194,13 @@ class Search:
         point: Point = {n: self.composed.effects[n].neutral() for n in self.along}
         linear = linearise(self.composed.moved(point), point, self.along)
         whiten = covariances(self.composed, linear).whitener()
-        note(self._told(linear, whiten))
+        note(self._describe_gap(linear, whiten))
         if any(w.regime == STRIKES for w in self.composed.windows):
             every = self._rolled_out(self.composed, base_at(self.composed, point), self.wanted)
             self.composed = with_wobble(self.composed, linear.with_moved(every))
         return self.fit((), point, [whiten])
 
-    def _told(self, linear: Linear, whiten: Whitener) -> str:
+    def _describe_gap(self, linear: Linear, whiten: Whitener) -> str:
         """Where the gap of the model as it came is and how large, with what is fitted along at its best along
         straight lines."""
         effects, left = self.composed.effects, np.nan_to_num(linear.residual)

@@ -75,11 +75,13 @@ class Source:
     def along(self, directions: np.ndarray, diagonal: bool = False) -> np.ndarray:
         """Its covariance (m, m) along the columns of `directions` (n, m), or the variances (m,) alone."""
         mine = directions[self.rows]
-        told = self.factor[:, None] * mine if self.factor.ndim == 1 else self.factor.T @ mine
-        return np.sum(told**2, 0) if diagonal else told.T @ told
+        seen = self.factor[:, None] * mine if self.factor.ndim == 1 else self.factor.T @ mine
+        return np.sum(seen**2, 0) if diagonal else seen.T @ seen
 
 
-def _with(variance: np.ndarray, start: np.ndarray, sources: Iterable[tuple[Source, float]]) -> np.ndarray:
+def _covariance(
+    variance: np.ndarray, start: np.ndarray, sources: Iterable[tuple[Source, float]]
+) -> np.ndarray:
     """The covariance (n, n) of noise, a start and sources, each with its s."""
     every, out = [start], np.diag(variance)
     for source, s in sources:
@@ -113,7 +115,7 @@ class Block:
     def covariance(self, discrepancy: Discrepancy = NONE) -> np.ndarray:
         """The rows' covariance (n, n) with a discrepancy."""
         mine = [(self.sources[n], s) for n, s in discrepancy.items() if n in self.sources]
-        return _with(self.variance, self.start, mine)
+        return _covariance(self.variance, self.start, mine)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +298,7 @@ class _Smooth:
             each = [block.sources[n].over(sd) if n in block.sources else None for n in names]
             smooth = [one for one in each if one is not None and one.factor.ndim == 2 and one.rows.size > 1]
             sizes = [max(float(np.sum(f**2)), 1e-300) ** -0.5 for f in (start, *(o.factor for o in smooth))]
-            both = _with(np.zeros(sd.size), sizes[0] * start, zip(smooth, sizes[1:], strict=True))
+            both = _covariance(np.zeros(sd.size), sizes[0] * start, zip(smooth, sizes[1:], strict=True))
             count = min(sd.size, SMOOTH * np.unique(block.channel).size)
             b = np.linalg.eigh(both)[1][:, -count:]
             other = np.eye(sd.size) - b @ b.T
@@ -354,7 +356,7 @@ class _Smooth:
         return half + 0.5 * square + 0.5 * float(np.sum(rest**2 / own))
 
     def cost(self, x: np.ndarray, left: np.ndarray, rest: np.ndarray) -> tuple[float, np.ndarray]:
-        """The same, and its gradient (K,)."""
+        """`value`, and its gradient (K,)."""
         variance = np.exp(x)
         whole = self.plain + np.tensordot(variance, self.source, 1)
         inverse, half_logs = _inverted(whole)

@@ -140,7 +140,7 @@ def test_a_linear_step_into_growth_without_end_is_taken_back(healthy, monkeypatc
     def astray(given, effects, u, usual):
         there = u.copy()
         there[at["drive"]], there[at["sin_grip_fx1"]] = -3.8, 15.0
-        return plain.cost - 100.0, there
+        return plain.cost - 100.0, there, plain.cost
 
     monkeypatch.setattr(searching, "_linear_step", astray)
     found = best_fit(given, *effects, plain)
